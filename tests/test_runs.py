@@ -15,6 +15,7 @@ from tests.test_cli import fakes  # noqa: F401 (a fixture that is used by itself
 from tests.test_migrations import renamed_back
 from tflane_jax.config import RealMapData, RecordedData, RunConfig, WorldData, load_config
 from tflane_jax.config_io import to_json
+from tflane_jax.datasets.argoverse2_log import ANNOTATIONS
 from tflane_jax.datasets.openlane_export import export_openlane_v2
 from tflane_jax.datasets.openlane_v2 import OpenLaneV2Config
 from tflane_jax.errors import UserError
@@ -171,3 +172,24 @@ def test_the_training_split_may_lie_in_another_folder(tmp_path):
         training_nearness(RunConfig(data=WorldData()), source, tmp_path / "elsewhere")
     with pytest.raises(UserError, match="has no training split in a folder: leave out --training-root"):
         training_nearness(RunConfig(), WorldData().source("test"), root)
+
+
+def test_the_source_logs_tell_the_city_of_training_frames(tmp_path):
+    """Both scenes drive at the same coordinates. The log of a training frame may be missing: its city is not known."""
+    pytest.importorskip("cv2")
+    one, two = (DriveDataset(DriveConfig(scenes, cameras=7)) for scenes in (1, 2))
+    root = export_openlane_v2({"train": one, "val": two}, tmp_path / "data", progress=False)
+    turned = export_openlane_v2({"train": two, "val": one}, tmp_path / "turned", progress=False)
+    for folder, city in (("both/scene 0", "PIT"), ("both/scene 1", "MIA"), ("first/scene 0", "PIT")):
+        (tmp_path / folder / "map").mkdir(parents=True)
+        (tmp_path / folder / "map" / f"log_map_archive_x____{city}_city_1.json").touch()
+        (tmp_path / folder / ANNOTATIONS).touch()
+    source = OpenLaneV2Config(root, "val", "A", image=None, tracks=tmp_path / "both")
+    found = training_nearness(RunConfig(data=WorldData()), source, root)
+    assert found is not None
+    assert found.groups == ["near training"] * 3 + ["far from training"] * 3
+    assert found.sentence() == "3 of 6 frames are within 5 m of a training frame; the nearest is 0.0 m away"
+    source = replace(source, root=turned, tracks=tmp_path / "first")
+    found = training_nearness(RunConfig(data=WorldData()), source, turned)
+    assert found is not None
+    assert found.groups == ["near training"] * 3

@@ -9,6 +9,7 @@ import contextlib
 import functools
 import importlib.util
 import sys
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
@@ -21,6 +22,7 @@ from flax.errors import FlaxError
 from tflane_jax.config import RunConfig
 from tflane_jax.config_io import added_settings, from_json, to_json, to_text
 from tflane_jax.datasets import sources
+from tflane_jax.datasets.base import MissingTracksWarning
 from tflane_jax.datasets.batches import in_workers
 from tflane_jax.datasets.data_source import loading_of
 from tflane_jax.datasets.overlap import Nearness, nearness
@@ -269,7 +271,9 @@ def training_nearness(config: RunConfig, source: Any, root: Path | None = None) 
     drives = sources.source_of(train).drives
     if drives is None or sources.source_of(source).drives is None:
         return None
-    trained = [drive for drive in drives(train) if len(drive.positions)]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", MissingTracksWarning)  # nobody looks at the traffic of these frames
+        trained = [drive for drive in drives(train) if len(drive.positions)]
     found = nearness(trained, sources.make_dataset(source)) if trained else None
     return found if found is not None and np.isfinite(found.distances).any() else None
 
@@ -283,8 +287,9 @@ def _training_split(source: Any, root: Path) -> Any:
             f"{sources.source_name(source)} has no training split in a folder: leave out --training-root, which works "
             "with argoverse2, openlane-v2 and nuscenes"
         )
-    # Of a data set with splits, the folder's own; of Argoverse 2, all logs in the folder. Places need no tracks.
-    changes = {"root": root, "split": "train", "tracks": None}
+    # Of a data set with splits, the folder's own; of Argoverse 2, all logs in the folder. The logs that tell the
+    # city of OpenLane-V2's frames may be missing.
+    changes = {"root": root, "split": "train", "without_tracks": "empty"}
     return replace(source, **{name: value for name, value in changes.items() if name in named})
 
 

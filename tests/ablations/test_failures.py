@@ -68,8 +68,9 @@ def test_a_failed_training_stops_no_other_and_is_listed(tiny, tmp_path, monkeypa
     assert len(content["failed"]) == 2
     last = [row for row in rows(out / "table.md") if row["checkpoint"] == "last"]
     assert [(row["model"], row["seeds"]) for row in last][:2] == [("base", "1, 2, 3"), ("tfm", "0, 2, 3")]
-    assert "two-sided t-test over the seeds that all models have (2, 3)" in (out / "paired.md").read_text()
-    assert all(row["seeds better"].endswith("of 2") for row in rows(out / "paired.md") if row["model"] == "tfm")
+    assert "two-sided t-test over the seeds that both have" in (out / "paired.md").read_text()
+    tested = [row for row in rows(out / "paired.md") if row["model"] == "tfm"]
+    assert {(row["seeds better"][1:], row["seeds"]) for row in tested} == {(" of 2", "2, 3")}
 
     # The same command trains what is missing.
     assert compare(tiny, out, "0123", "--test", "few=--data.test 3") == 0
@@ -125,7 +126,24 @@ def test_paired_tests_name_the_seeds_of_each_checkpoint(tmp_path, capsys):
                 results.add("", "best", model, seed, measured)
     save_report(results, RunConfig().task, {}, tmp_path)
     title = (tmp_path / "paired.md").read_text().splitlines()[0]
-    assert "over the seeds that all models have (0, 1, 2 at the last checkpoint; 0, 2 at the best checkpoint)" in title
+    assert "two-sided t-test over the seeds that both have" in title
+    tested = {(row["checkpoint"], row["seeds"]) for row in rows(tmp_path / "paired.md") if row["model"] == "tfm"}
+    assert tested == {("last", "-"), ("best", "0, 2")}
+
+
+def test_a_row_that_lacks_seeds_takes_none_from_another_row(tmp_path, capsys):
+    """Regression: paired tests took the seeds that all rows have, so one failed row left the others without any."""
+    results = Results(("base", "tfm", "poor", "none"), (0, 1, 2), {}, "a protocol")
+    has = {"base": (0, 1, 2), "tfm": (0, 1, 2), "poor": (1,)}
+    for model, seeds in has.items():
+        for seed in seeds:
+            scores = {"": {"all/recall": 0.1 * seed + len(model)}}
+            results.add("", "last", model, seed, Measured(4, "a protocol", scores, {"": {}}))
+    save_report(results, RunConfig().task, {}, tmp_path)
+    found = {row["model"]: row for row in rows(tmp_path / "paired.md")}
+    assert found["tfm"]["seeds better"] == "0 of 3"
+    assert (found["poor"]["seeds better"], found["poor"]["seeds"], found["poor"]["p"]) == ("0 of 1", "1", "n/a")
+    assert "no paired tests (best checkpoint, test split): no two seeds with base" in capsys.readouterr().out
 
 
 def test_an_evaluation_that_fails_is_listed_too(tiny, tmp_path, monkeypatch, capsys):

@@ -10,7 +10,6 @@ import pytest
 from tests.test_cli import fakes  # noqa: F401 (a fixture that is used by itself)
 from tflane_jax.ablations import workers
 from tflane_jax.ablations.declaration import Claim, check
-from tflane_jax.ablations.paper.cost import core_minutes
 from tflane_jax.ablations.paper.table import PaperTable, Quoted, TableRow, longer, shortened
 from tflane_jax.ablations.published import page, record
 from tflane_jax.ablations.scores import is_measured
@@ -295,19 +294,6 @@ def test_the_page_is_written_anew_without_a_table(tmp_path, capsys):
     assert f"written: {tmp_path / 'results.md'}" in capsys.readouterr().out
 
 
-def test_runs_that_tables_share_cost_once():
-    host = TableRow("host", "h")
-    rows = (TableRow("a", "c:a"), TableRow("b", "c:b", start="host"), host)
-    table = small("c", rows=rows, claims=(), hosts=(host,), seeds=3, minutes=2.0, host_minutes=20.0)
-    assert core_minutes([table]) == 3 * (2 + 2 + 20)
-    fewer = replace(table, name="paper.10", seeds=2)
-    assert core_minutes([table, fewer]) == core_minutes([fewer, table]) == core_minutes([table])
-    other_host = replace(table, hosts=(TableRow("host", "h:other"),), rows=rows[:2])
-    assert core_minutes([table, other_host]) == core_minutes([table]) + 3 * (2 + 20)
-    assert core_minutes([table, replace(table, steps=9)]) == 2 * core_minutes([table])
-    assert core_minutes([table.lengthened(4)]) == 4 * core_minutes([table])
-
-
 @pytest.mark.parametrize("name", [name for name in TABLES if name.endswith("_as_written")])
 def test_every_marker_of_a_table_as_written_enters_by_eq_3_to_the_letter(name):
     table, ours = TABLES[name], TABLES[name.removesuffix("_as_written")]
@@ -316,18 +302,6 @@ def test_every_marker_of_a_table_as_written_enters_by_eq_3_to_the_letter(name):
     assert any(priors)
     markers = [config.task.model.priors.markers for config in ours.configs(ours.rows).values()]
     assert [found and as_written(found) for found in markers] == priors  # nothing else is different
-
-
-def test_estimates_are_what_was_recorded():
-    from tests.shared import ROOT
-
-    for path in (ROOT / "docs" / "results").glob("*.json"):
-        table, recorded = TABLES[path.stem], json.loads(path.read_text())["core minutes of a run"]
-        hosts = {host.name for host in table.hosts}
-        rows = (table.minutes, recorded.keys() - hosts), (table.host_minutes, recorded.keys() & hosts)
-        for estimate, names in rows:
-            minutes = [recorded[name] for name in names]
-            assert not minutes or estimate == pytest.approx(sum(minutes) / len(minutes), abs=1.0)
 
 
 def test_the_page_of_results_is_what_its_summaries_give():

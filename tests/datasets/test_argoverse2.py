@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from tests.datasets.small_argoverse2 import FRAMES, MAP, MS, POSE, box, points, write, write_log
-from tflane_jax.datasets import argoverse2
+from tflane_jax.datasets import argoverse2, log_frames
 from tflane_jax.datasets.argoverse2 import Argoverse2Config, Argoverse2Dataset
 from tflane_jax.datasets.argoverse2_log import ANNOTATIONS, POSES, check_log, find_logs, load_log
 from tflane_jax.datasets.argoverse2_map import line_type, read_map
@@ -136,7 +136,7 @@ def test_logs_are_read_when_they_are_needed_and_few_are_kept(folder, monkeypatch
         return made
 
     monkeypatch.setattr(argoverse2, "load_log", counted)
-    monkeypatch.setattr(argoverse2, "_KEPT", 1)
+    monkeypatch.setattr(log_frames, "_KEPT", 1)
     dataset = Argoverse2Dataset(Argoverse2Config(folder.parent))
     assert (len(dataset), dataset.info(3).scene, dataset.info(3).area, read) == (4, "log-b", "PIT", [])
     alone = load_log(folder)

@@ -133,7 +133,7 @@ DAMAGE = {
     "meta no JSON": (changed(meta=np.array("scene")), "meta is no JSON text"),
     "no rate": (changed(meta=np.array('{"scene": "a", "rate_hz": 0}')), "rate_hz key frames a second, not 'a' and 0"),
     "no time at all": (changed(meta=np.array('{"scene": "a", "rate_hz": 1e-300}')), "not 'a' and 1e-300"),
-    "objects": (changed(category=np.array([{}, {}], object)), "no npz file of plain arrays"),
+    "objects": (changed(category=np.array([{}, {}], object)), "no .npz file of plain arrays"),
     **{f"{key} missing": (lambda scene, key=key: scene.pop(key), f"lacks the entry '{key}'") for key in content()},
 }
 
@@ -154,7 +154,7 @@ def test_what_is_no_scene_file_is_named(tmp_path):
     whole = path.read_bytes()
     for damaged in (b"", b"text", whole[: len(whole) // 2]):
         path.write_bytes(damaged)
-        with pytest.raises(UserError, match=r"scene\.npz is no npz file of plain arrays"):
+        with pytest.raises(UserError, match=r"scene\.npz is no .npz file of plain arrays"):
             read_scene_file(path)
     np.save(tmp_path / "array.npy", np.zeros(3))
     for name in ("array.npy", "none.npz"):
@@ -192,7 +192,8 @@ def test_scenes_are_chosen_by_name_or_official_split(tmp_path):
         SceneFileDataset(SceneFileConfig(tmp_path, ("scene-7",)))
     assert chosen("--data", "nuscenes-scenes", "--root", tmp_path).scenes == ()
     assert chosen("--data", "nuscenes-scenes", "--root", tmp_path, "--split", "val").scenes == ("scene-0103",)
-    with pytest.raises(UserError, match="has no scene of nuScenes' split test"):
+    message = r"has no scene of nuScenes' split test: choose --split train or val, or leave it out to take all$"
+    with pytest.raises(UserError, match=message):
         chosen("--data", "nuscenes-scenes", "--root", tmp_path, "--split", "test")
 
 

@@ -8,6 +8,7 @@ import pytest
 from tests.datasets.openlane_scenes import FRAMES, DriveConfig, DriveDataset
 from tests.fakes import FakeConfig, FakeDataset
 from tflane_jax.cli import main
+from tflane_jax.datasets.argoverse2_log import ANNOTATIONS
 from tflane_jax.datasets.base import ExampleConfig
 from tflane_jax.datasets.openlane_export import dense, export_openlane_v2
 from tflane_jax.datasets.openlane_frames import SUBSETS
@@ -147,7 +148,28 @@ def test_the_command_writes_checks_and_counts(tmp_path, monkeypatch, capsys):
         ("--out new --tracks full --data.example.cameras default", "full is not empty"),
         ("--out new --tracks ./new --data.example.cameras default", "--out and --tracks are both new"),
         ("--out new --config gtn_lane/gtn", "front-views-train are single images"),
-        ("--out new", "procedural-train has no camera images, which OpenLane-V2 needs: set data.example.cameras"),
+        ("--out new", "procedural-train has no camera images, which OpenLane-V2 needs: set data.example.cameras\n"),
+        (
+            "--out new --data recorded --root .",
+            "recorded has no camera images, which OpenLane-V2 needs: choose data with",
+        ),
+        ("--out new --data argoverse2 --root one", "one has no split train, only val: add --splits val\n"),
+        (
+            "--out new --data argoverse2 --root one --splits val",
+            "argoverse2-val has no camera images, which OpenLane-V2 needs: name a configuration with cameras",
+        ),
+        (
+            "--out new --data argoverse2 --root one/val",
+            "one/val is not divided into splits, so --splits train cannot choose among its logs: add --splits val, or ",
+        ),
+        (
+            "--out new --data argoverse2 --root one/val/log",
+            "one/val/log is not divided into splits, so --splits train cannot choose among its logs: name a folder ",
+        ),
+        (
+            "--out new --data nuscenes-scenes --root scenes",
+            "scenes has no scene of nuScenes' split train: choose --splits val\n",
+        ),
     ],
 )
 def test_what_cannot_be_exported_is_told_before_examples_are_made(arguments, message, tmp_path, monkeypatch, capsys):
@@ -156,6 +178,10 @@ def test_what_cannot_be_exported_is_told_before_examples_are_made(arguments, mes
     (tmp_path / "config.py").write_text("from tflane_jax.config import RunConfig as get_config")
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "notes.txt").touch()
+    (tmp_path / "one" / "val" / "log").mkdir(parents=True)
+    (tmp_path / "one" / "val" / "log" / ANNOTATIONS).touch()
+    (tmp_path / "scenes").mkdir()
+    (tmp_path / "scenes" / "scene-0103.npz").touch()
     config = [] if "--config" in arguments else ["--config", "config.py"]
     assert main(["data", "export", *config, *arguments.split()]) == 2
     assert capsys.readouterr().err.startswith(f"tflane: {message}")

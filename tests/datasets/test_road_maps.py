@@ -182,7 +182,7 @@ def test_the_content_tells_changed_files(tmp_path):
 def test_a_damaged_scene_file_is_named_and_not_passed_over(tmp_path):
     (tmp_path / "scene-1.npz").write_bytes(b"no zip")
     (one,) = find_maps(tmp_path)
-    with pytest.raises(UserError, match=r"scene-1\.npz is no npz file"):
+    with pytest.raises(UserError, match=r"scene-1\.npz is no .npz file"):
         one.read()
 
 

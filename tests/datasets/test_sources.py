@@ -173,6 +173,9 @@ def test_a_split_that_logs_do_not_have_is_refused(logs):
         with pytest.raises(UserError, match="is not divided into splits, so --split train cannot"):
             chosen("--data", "argoverse2", "--root", where, "--split", "train")
     assert chosen("--data", "argoverse2", "--root", folder, "--split", "val") == Argoverse2Config(folder)
+    shutil.rmtree(logs / "sensor" / "train")
+    with pytest.raises(UserError, match=r"has no split test, only val: add --split val$"):
+        chosen("--data", "argoverse2", "--root", logs)
 
 
 @pytest.mark.parametrize(

@@ -79,7 +79,11 @@ def test_frames_are_counted():
     oblique = found.pop("oblique fraction of lane length")
     assert oblique == pytest.approx(10.0 * np.pi * 14 / 20 / (40.0 + 10.0 * np.pi), rel=1e-2)
     counts = {"lanes": 2, "connectors": 1, "topology links": 1, "crossings": 1, "road boundaries": 2}
-    assert found == counts | {"lanes beside the vehicle": 1, "- oncoming": 0, "vehicle on a connector": 0}
+    assert found == counts | {
+        "lanes beside the vehicle": 1,
+        "oncoming lanes beside the vehicle": 0,
+        "vehicle on a connector": 0,
+    }
 
 
 @pytest.mark.parametrize(
@@ -100,7 +104,7 @@ def test_lanes_around_the_vehicle(moved, turned, beside, oncoming, on_connector)
     frame.lanes.points[..., :2] = xy @ np.array([[cos, sin], [-sin, cos]])
     found = frame_quantities(frame)
     assert found["lanes beside the vehicle"].item() == beside
-    assert found["- oncoming"].item() == oncoming
+    assert found["oncoming lanes beside the vehicle"].item() == oncoming
     assert found["vehicle on a connector"].item() == on_connector
 
 

@@ -62,6 +62,25 @@ def test_the_nearer_of_two_lanes_counts_and_lanes_outside_fill_no_cell():
     np.testing.assert_array_equal(cells.inside[1], False)
 
 
+@pytest.mark.parametrize("twice", range(3))
+def test_a_repeated_point_changes_nothing(twice):
+    """Regression: cells nearest to a first point that is there twice learned the direction (0, 0)."""
+    line = [[2.3, 1.5, 0], [4.1, 1.6, 0], [6.6, 2.9, 0]]
+    doubled = [*line[: twice + 1], *line[twice:]]
+    for found, expected in zip(
+        lane_cells(graph(doubled), SHAPE, RANGE), lane_cells(graph(line), SHAPE, RANGE), strict=True
+    ):
+        np.testing.assert_array_equal(found, expected)
+
+
+def test_a_lane_of_a_single_place_fills_no_cell():
+    line, other = [[0.0, 0.5, 0], [8.0, 0.5, 0]], [[4.5, 2.5, 0], [4.5, 2.5, 0]]
+    for found, expected in zip(
+        lane_cells(graph(line, other), SHAPE, RANGE), lane_cells(graph(line), SHAPE, RANGE), strict=True
+    ):
+        np.testing.assert_array_equal(found, expected)
+
+
 def test_padding_changes_nothing():
     line = [[0.0, 0.5, 0], [8.0, 3.5, 0]]
     said = jax.random.normal(jax.random.key(0), (*SHAPE, CELL_CHANNELS))

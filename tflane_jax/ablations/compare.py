@@ -46,7 +46,7 @@ def compare(
     Every run is evaluated at its last step, which is the primary result because no selection favours a model, and at
     its best one by `training.best_metric` on the validation split. A model with interventions (without traffic flow at
     inference, with that of another scene) gets a row for each, evaluated from the same runs. A training that fails does
-    not stop the others: the tables hold the complete runs, and paired tests the seeds that all models have.
+    not stop the others: the tables hold the complete runs, and paired tests the seeds that both rows have.
 
     Args:
         configs: by the name that the table shows; the first one is the control.

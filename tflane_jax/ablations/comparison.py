@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from tflane_jax.ablations.statistics import holm, paired_difference
-from tflane_jax.errors import UserError
 
 Scores = dict[str, float]
 """Metrics by "group/name", as `tasks.Evaluation.scores` returns them."""
@@ -21,7 +21,7 @@ class Variant:
 
     Attributes:
         name: of the row.
-        scores: of each seed. For paired tests, entry i of all variants comes from the same seed.
+        scores: of each seed.
     """
 
     name: str
@@ -29,40 +29,40 @@ class Variant:
 
 
 def summarise(
-    variants: Sequence[Variant], metrics: Sequence[str], errors: Collection[str] = ()
+    rows: Mapping[str, Mapping[int, Scores]], metrics: Sequence[str], errors: Collection[str] = ()
 ) -> list[dict[str, Any]]:
-    """Return one row for each variant and metric: mean, standard deviation, and the difference to the first variant.
+    """Return one row for each metric and variant: mean, standard deviation, and the difference to the first variant.
 
-    "p" is that of the paired t-test, "p (Holm)" the same corrected for all tests in the rows.
+    The difference and its tests are over `shared_seeds`, the mean and the standard deviation over all of a variant's.
+    "p" is that of the paired t-test, NaN for a single seed, and "p (Holm)" the same corrected for all tests of the
+    table. A variant that shares no seed with the first one has no difference.
 
     Args:
-        variants: the first one is the control.
+        rows: scores by seed of each variant; the first one is the control.
         metrics: names as in `Scores`.
         errors: metrics where lower is better.
-
-    Raises:
-        UserError: variants have different numbers of seeds, so that nothing can be paired.
     """
-    if len({len(variant.scores) for variant in variants}) > 1:
-        counts = ", ".join(f"{v.name}: {len(v.scores)}" for v in variants)
-        raise UserError(f"a paired test needs the same seeds for all variants, got {counts}")
-    rows = []
+    found, (control, *_) = [], rows
     for metric in metrics:
-        control = _column(variants[0], metric)
-        for variant in variants:
-            values = _column(variant, metric)
-            row: dict[str, Any] = {"metric": metric, "model": variant.name, "mean": float(values.mean())}
-            row["std"] = float(values.std(ddof=1)) if len(values) > 1 else None
-            if variant is not variants[0]:
-                test = paired_difference(values, control)
+        for name, by_seed in rows.items():
+            mean, std = _mean_and_std(_column(by_seed.values(), metric))
+            row: dict[str, Any] = {"metric": metric, "model": name, "mean": mean, "std": std}
+            if name != control and (seeds := shared_seeds(by_seed, rows[control])):
+                treated, other = (_column([rows[one][seed] for seed in seeds], metric) for one in (name, control))
+                test = paired_difference(treated, other)
                 row |= {"difference": test.mean, "std of difference": test.std, "p": test.p_value}
-                better = paired_difference(control, values).better if metric in errors else test.better
+                better = paired_difference(other, treated).better if metric in errors else test.better
                 row["p (Holm)"], row["seeds better"] = None, f"{better} of {test.seeds}"
-            rows.append(row)
-    tested = [row for row in rows if "p" in row]
+            found.append(row)
+    tested = [row for row in found if "p" in row]
     for row, corrected in zip(tested, holm([row["p"] for row in tested]), strict=True):
         row["p (Holm)"] = corrected
-    return rows
+    return found
+
+
+def shared_seeds(one: Mapping[int, Scores], other: Mapping[int, Scores]) -> list[int]:
+    """Return the seeds of one variant that the other has, too."""
+    return [seed for seed in one if seed in other]
 
 
 def compact(variants: Sequence[Variant], metrics: Sequence[str]) -> list[dict[str, str]]:
@@ -71,12 +71,16 @@ def compact(variants: Sequence[Variant], metrics: Sequence[str]) -> list[dict[st
     for variant in variants:
         row = {"model": variant.name}
         for metric in metrics:
-            values = 100.0 * _column(variant, metric)
+            values = 100.0 * _column(variant.scores, metric)
             spread = f" ± {values.std(ddof=1):.1f}" if len(values) > 1 else ""
             row[metric] = f"{values.mean():.1f}{spread}" if np.isfinite(values).all() else "n/a"
         rows.append(row)
     return rows
 
 
-def _column(variant: Variant, metric: str) -> np.ndarray:
-    return np.array([scores[metric] for scores in variant.scores])
+def _column(scores: Iterable[Scores], metric: str) -> Float[np.ndarray, " s"]:
+    return np.array([of_seed[metric] for of_seed in scores])
+
+
+def _mean_and_std(values: Float[np.ndarray, " s"]) -> tuple[float, float | None]:
+    return float(values.mean()), float(values.std(ddof=1)) if len(values) > 1 else None

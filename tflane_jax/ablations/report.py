@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from tflane_jax.ablations.comparison import Variant, compact, summarise
+from tflane_jax.ablations.comparison import Variant, compact, shared_seeds, summarise
 from tflane_jax.ablations.jobs import file_names
 from tflane_jax.ablations.results import Results
 from tflane_jax.ablations.scores import CHECKPOINTS, OWN_TEST
@@ -72,26 +72,27 @@ def _save_table(
 
 
 def _save_paired(results: Results, test: str, metrics: Sequence[str], task: Task, stem: Path) -> list[Path]:
-    """Print and save the paired tests over the seeds that all rows have; nothing without two of them or a control."""
+    """Print and save the paired tests of every row against the control, over the seeds that both have.
+
+    Nothing at a checkpoint where no row has two seeds with the control.
+    """
     rows: list[dict[str, Any]] = []
     control, seeds = results.models[0], {}
     for which in CHECKPOINTS:
         table = results.rows(test, which)
-        shared = [seed for seed in results.seeds if table and all(seed in by_seed for by_seed in table.values())]
-        if not results.has(control) or len(shared) < 2:
-            why = f"no run of {control}" if not results.has(control) else "fewer than two seeds that all models have"
+        pairs = {row: shared_seeds(by_seed, table.get(control, {})) for row, by_seed in table.items()}
+        if max((len(shared) for row, shared in pairs.items() if row != control), default=0) < 2:
+            why = f"no two seeds with {control}" if results.has(control) else f"no run of {control}"
             print(f"\nno paired tests ({which} checkpoint, {results.title(test)}): {why}")
             continue
-        variants = [Variant(row, tuple(by_seed[seed] for seed in shared)) for row, by_seed in table.items()]
-        rows += [{"checkpoint": which} | row for row in summarise(variants, metrics, task.errors)]
-        seeds[which] = shared
+        seeds[which] = pairs
+        for row in summarise(table, metrics, task.errors):
+            shared = pairs[row["model"]]
+            part = {} if len(shared) == len(results.seeds) else {"seeds": listed(shared) or "none"}
+            rows.append({"checkpoint": which} | row | part)
     if not rows:
         return []
-    whole = all(len(shared) == len(results.seeds) for shared in seeds.values())
-    lists = [f"{listed(shared)} at the {which} checkpoint" for which, shared in seeds.items()]
-    if len(set(map(tuple, seeds.values()))) == 1:  # of both checkpoints
-        lists = [listed(next(iter(seeds.values())))]
-    over = _count(results.seeds) if whole else f"the seeds that all models have ({'; '.join(lists)})"
+    over = "the seeds that both have" if any("seeds" in row for row in rows) else _count(results.seeds)
     title = f"{results.protocol}, {results.title(test)}: paired differences to {control}, two-sided t-test over {over}"
     title += "; p (Holm) is corrected for all tests of one checkpoint"
     print("\n" + format_table(rows, title=title, digits=4))

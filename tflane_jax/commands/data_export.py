@@ -61,13 +61,16 @@ def _check_folders(out: Path, tracks: Path | None) -> None:
 
 def _check_cameras(chosen: Mapping[Split, Any]) -> None:
     for source in chosen.values():
-        if sources.source_of(source).example is RoadImage:
-            raise UserError(f"{sources.source_name(source)} are single images: OpenLane-V2 has six or seven cameras")
+        kind, name = sources.source_of(source), sources.source_name(source)
+        if kind.example is RoadImage:
+            raise UserError(f"{name} are single images: OpenLane-V2 has six or seven cameras")
         if source.example.cameras is None and getattr(source, "image", None) is None:
-            raise UserError(
-                f"{sources.source_name(source)} has no camera images, which OpenLane-V2 needs: set "
-                "data.example.cameras (built-in world) or data.image"
-            )
+            remedy = "choose data with cameras"
+            if kind.build is not None:
+                remedy = "set data.example.cameras"
+            elif hasattr(source, "image"):
+                remedy = "name a configuration with cameras (--config)"
+            raise UserError(f"{name} has no camera images, which OpenLane-V2 needs: {remedy}")
 
 
 def _sd_maps(chosen: Mapping[Split, Any]) -> dict[Split, dict[str, Any]]:

@@ -84,16 +84,15 @@ def chosen_source(config: RunConfig, options: argparse.Namespace, split: Split |
     Args:
         config: of the run; its task determines the type of examples.
         options: of the command line.
-        split: overrides --split.
+        split: overrides --split: one of --splits.
 
     Raises:
         UserError: the source has another type of examples, --root is missing or not supported, or the folder does not
             have the split.
     """
-    given = split or options.split
-    split = given or options.default_split
-    assert split is not None
-    configured = config.data.source(split)
+    given, option = (options.split, "--split") if split is None else (split, "--splits")
+    chosen: Split = given or options.default_split
+    configured = config.data.source(chosen)
     kind = RoadImage if isinstance(config.task, LaneShapeTask) else Example
     check_kind(config)
     source = source_of(configured) if options.data is None else named_source(options.data)
@@ -103,7 +102,7 @@ def chosen_source(config: RunConfig, options: argparse.Namespace, split: Split |
         return configured
     _check_choice(source, kind, options)
     root, openlane = (None if path is None else Path(path) for path in (options.root, options.openlane))
-    return source.choose(Choice(split, given is not None, configured, root, openlane))
+    return source.choose(Choice(chosen, given is not None, configured, root, openlane, option))
 
 
 def source_for(run: Run, options: argparse.Namespace) -> Any:

@@ -19,6 +19,7 @@ import numpy as np
 
 from tflane_jax.convert.torch_pickle import KINDS, Damaged, Tensor, TorchUnpickler, Unreadable, to_array
 from tflane_jax.errors import UserError
+from tflane_jax.files.npz import npz_arrays
 from tflane_jax.files.plain_pickle import Refused
 
 _LEGACY_MAGIC = 0x1950A86A20F9469CFC6C
@@ -110,9 +111,7 @@ def _contents(file: IO[bytes]) -> _Contents:
     archive = zipfile.ZipFile(file)
     names = archive.namelist()
     if any(name.endswith(".npy") for name in names):
-        file.seek(0)
-        with np.load(file, allow_pickle=False) as arrays:
-            return _Contents({name: arrays[name] for name in arrays.files}, _nothing, "little")
+        return _Contents(npz_arrays(file), _nothing, "little")
     objects = [name for name in names if name.split("/", 1)[-1] == "data.pkl"]
     if len(objects) != 1:
         raise Damaged("a zip file, but none of PyTorch's (it has no data.pkl) or of numpy's (no .npy)")

@@ -15,19 +15,18 @@ from tflane_jax.datasets.argoverse2_log import (
     ANNOTATIONS,
     Keyframes,
     check_log,
-    city_of,
     find_logs,
     load_log,
-    read_keyframes,
+    log_outline,
 )
 from tflane_jax.datasets.base import SPLITS, ExampleConfig, FrameInfo, Split
 from tflane_jax.datasets.data_source import Choice, DataSource, FolderCheck
 from tflane_jax.datasets.examples import make_example
+from tflane_jax.datasets.log_frames import LogFrames
 from tflane_jax.datasets.openlane_example import camera_views
 from tflane_jax.datasets.openlane_v2 import OpenLaneV2Config
 from tflane_jax.datasets.overlap import frame_drives
 from tflane_jax.datasets.photometric import PhotometricConfig
-from tflane_jax.datasets.recent import Recent
 from tflane_jax.datasets.streaming import StreamingConfig
 from tflane_jax.datasets.view_images import ImageConfig, ImageFit
 from tflane_jax.errors import UserError
@@ -35,8 +34,6 @@ from tflane_jax.scene import CameraViews, Example
 from tflane_jax.scene.logs import KeyFrame, Log
 from tflane_jax.world.cameras.ring import ARGOVERSE2_RING, CameraRigConfig
 
-# Logs in memory: one takes 2.4 MB with its prepared map, and a sixth of a second to read.
-_KEPT = 256
 _PICTURES = ImageConfig(scale=0.5)
 """Of images that no model reads: whole, at half the size."""
 
@@ -65,7 +62,7 @@ class Argoverse2Config:
 class Argoverse2Dataset:
     """Examples of every log below a folder, sorted by log id, then time.
 
-    Boxes and maps are read when an example needs them, and those of the last `_KEPT` logs are kept.
+    Boxes and maps are read when an example needs them, see `LogFrames`.
 
     Raises UserError where there is no log, or the times and poses of one cannot be read, with `image` also where a log
     has no images. `example` raises it for damaged boxes or a damaged map.
@@ -78,12 +75,9 @@ class Argoverse2Dataset:
         if config.image is not None and config.example.cameras is not None:
             raise UserError("image reads recorded images, example.cameras draws others: set one of them to None")
         self._folders = find_logs(config.root)
-        self._keyframes = [read_keyframes(folder, config.keyframes, config.openlane) for folder in self._folders]
-        self._cities = [city_of(folder) for folder in self._folders]
-        self._frames = [(row, i) for row, moments in enumerate(self._keyframes) for i in range(len(moments))]
-        self._log: Recent[Path, Log] = Recent(
-            partial(load_log, keyframes=config.keyframes, openlane=config.openlane), _KEPT
-        )
+        which = config.keyframes, config.openlane
+        outlines = [log_outline(folder, *which) for folder in self._folders]
+        self._frames = LogFrames(outlines, partial(_read, self._folders, *which))
         wanted = config.image is not None
         self._images = [LogImages(folder) if wanted else None for folder in self._folders]
         self._fits = ring_fits(filter(None, self._images), config.image) if config.image is not None else ()
@@ -93,11 +87,11 @@ class Argoverse2Dataset:
 
     def example(self, index: int) -> Example:
         """Return one example; a camera without an image at that time is not valid."""
-        config, (row, number) = self.config, self._frames[index]
-        example, images = make_example(self._log(self._folders[row]), number, config.example), self._images[row]
+        config, (row, moment) = self.config, self._frames.place(index)
+        example, images = make_example(*self._frames[index], config.example), self._images[row]
         if images is None or config.image is None:
             return example
-        cameras = images.at(self._keyframes[row][number])
+        cameras = images.at(moment)
         return replace(example, cameras=camera_views(cameras, self._fits, config.image))
 
     def views(self, indices: Sequence[int]) -> list[CameraViews | None]:
@@ -105,24 +99,23 @@ class Argoverse2Dataset:
 
         Raises UserError for an image or a calibration that cannot be read.
         """
-        places = [self._frames[index] for index in indices]
+        places = [self._frames.place(index) for index in indices]
         there = {row: LogImages(self._folders[row]) for row, _ in places if has_images(self._folders[row])}
         image = self.config.image or _PICTURES
         fits = ring_fits(there.values(), image)
-        return [
-            _views(there[row], self._keyframes[row][number], fits, image) if row in there else None
-            for row, number in places
-        ]
+        return [_views(there[row], moment, fits, image) if row in there else None for row, moment in places]
 
     def info(self, index: int) -> FrameInfo:
         """Return log id, time and pose of one example."""
-        row, number = self._frames[index]
-        name, moment = self._folders[row].name, self._keyframes[row][number]
-        return FrameInfo("argoverse2", name, moment.timestamp_ns, moment.global_from_ego, self._cities[row])
+        return self._frames.info(index)
 
     def drives(self) -> Iterator[Log]:
         """Yield the logs."""
-        yield from map(self._log, self._folders)
+        return self._frames.logs()
+
+
+def _read(folders: Sequence[Path], keyframes: Keyframes, openlane: Path | None, row: int) -> Log:
+    return load_log(folders[row], keyframes=keyframes, openlane=openlane)
 
 
 def _views(
@@ -162,16 +155,14 @@ class LogData:
         return Argoverse2Config(root, self.keyframes, self.openlane, self.example, self.loading, self.image)
 
 
-def split_folder(root: Path, split: Split, *, required: bool) -> Path:
-    """Return the folder of a split below `root`; `root` itself where it is not divided into splits.
+def _split_folder(choice: Choice) -> Path:
+    """Return the folder of a split below the root; the root itself where it is not divided into splits.
 
-    Args:
-        root: a dataset root (sensor/<split>/<log id>/), a folder of splits, a folder of logs, or one log.
-        split: train, val or test.
-        required: whether a folder without splits is an error, unless its own name is that of the split.
-
-    Raises UserError where `root` has splits but not this one, or none and one is required.
+    Raises UserError where the root has splits but not this one, or none although one was asked for, unless the root's
+    own name is that of the split.
     """
+    root, split, option = choice.root, choice.split, choice.option
+    assert root is not None
     places = [root / "sensor", root]
     present = [place / name for place in places for name in SPLITS if (place / name).is_dir()]
     for folder in present:
@@ -179,18 +170,22 @@ def split_folder(root: Path, split: Split, *, required: bool) -> Path:
             return folder
     if present:
         names = ", ".join(folder.name for folder in present)
-        raise UserError(f"{root} has no split {split}, only {names}: choose one with --split")
-    if required and root.is_dir() and root.name != split:
+        which = f"add {option} {names}" if len(present) == 1 else f"choose one with {option}"
+        raise UserError(f"{root} has no split {split}, only {names}: {which}")
+    if choice.split_given and root.is_dir() and root.name != split:
+        if option == "--split":
+            remedy = "leave --split out to take all of them, or "
+        else:
+            remedy = f"add {option} {root.name}, or " if root.name in SPLITS else ""
         raise UserError(
-            f"{root} is not divided into splits, so --split {split} cannot choose among its logs: leave --split out to "
-            f"take all of them, or name a folder that holds {split}/<log id>/{ANNOTATIONS}"
+            f"{root} is not divided into splits, so {option} {split} cannot choose among its logs: {remedy}name a "
+            f"folder that holds {split}/<log id>/{ANNOTATIONS}"
         )
     return root
 
 
 def _choose(choice: Choice) -> Argoverse2Config:
-    assert choice.root is not None
-    root, example = split_folder(choice.root, choice.split, required=choice.split_given), choice.configured.example
+    root, example = _split_folder(choice), choice.configured.example
     image = _recorded(choice.configured, root)
     if image is not None:  # recorded images take the place of drawn ones
         example = replace(example, cameras=None)

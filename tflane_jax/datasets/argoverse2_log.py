@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from tflane_jax.datasets.argoverse2_map import read_map
+from tflane_jax.datasets.log_frames import LogOutline
 from tflane_jax.datasets.openlane_splits import openlane_timestamps
 from tflane_jax.datasets.plausible import FARTHEST, check_distance, check_interval, check_motion, check_place
 from tflane_jax.errors import UserError
@@ -127,10 +128,10 @@ def load_log(
     )
 
 
-def read_keyframes(folder: Path, keyframes: Keyframes, openlane: Path | None) -> tuple[KeyFrame, ...]:
+def log_outline(folder: Path, keyframes: Keyframes = "openlane_v2", openlane: Path | None = None) -> LogOutline:
     """Return the key frames of a log as `load_log` does, without reading boxes and map; raises UserError like it."""
     times = read_columns(folder / ANNOTATIONS, {"timestamp_ns": "integer"})["timestamp_ns"]
-    return _drive(folder, times, keyframes, openlane)[2]
+    return LogOutline(folder.name, "argoverse2", city_of(folder), _drive(folder, times, keyframes, openlane)[2])
 
 
 def _drive(

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, Literal, Protocol, TypeVar
 
 from tflane_jax.datasets.base import ExampleConfig, Split
 from tflane_jax.datasets.loading import load_or_stream
@@ -48,6 +48,7 @@ class Choice:
         configured: the run configuration's own config of this split, of any dataset with the same kind of example.
         root: from --root; None only for sources without a root.
         openlane: from --openlane, folder of the OpenLane-V2 split files.
+        option: that names the split, for messages; --splits cannot be left out.
     """
 
     split: Split
@@ -55,6 +56,7 @@ class Choice:
     configured: Any
     root: Path | None = None
     openlane: Path | None = None
+    option: Literal["--split", "--splits"] = "--split"
 
 
 @dataclass(frozen=True)

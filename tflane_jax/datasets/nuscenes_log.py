@@ -148,13 +148,16 @@ def scene_log(
         global_from_ego=frames.global_from_frame,
         tracks=tracks,
         actors=tracks,
-        keyframes=tuple(
-            KeyFrame(int(time), pose, number)
-            for number, (time, pose) in enumerate(zip(frames.timestamps_ns, frames.global_from_frame, strict=True))
-        ),
+        keyframes=key_frames(frames),
         seed=zlib.crc32(scene["name"].encode()),
         area=tables.location(scene),
     )
+
+
+def key_frames(frames: SceneFrames) -> tuple[KeyFrame, ...]:
+    """Return the moments that become examples: all of them."""
+    poses = zip(frames.timestamps_ns.tolist(), frames.global_from_frame, strict=True)
+    return tuple(KeyFrame(time, pose, number) for number, (time, pose) in enumerate(poses))
 
 
 def side_of(location: str) -> Side | None:

@@ -7,7 +7,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from tflane_jax.datasets.nuscenes_log import scene_frames, scene_log
+from tflane_jax.datasets.log_frames import LogOutline
+from tflane_jax.datasets.nuscenes_log import key_frames, scene_frames, scene_log
 from tflane_jax.datasets.nuscenes_map import MapExpansion, read_expansion
 from tflane_jax.datasets.nuscenes_tables import TABLES, Tables, read_tables
 from tflane_jax.errors import UserError
@@ -60,6 +61,13 @@ def read_scene(folder: Path, name: str) -> Log:
     frames = scene_frames(tables, scene)
     expansion = _expansion(folder.parent / "maps" / "expansion" / f"{tables.location(scene)}.json")
     return scene_log(tables, scene, frames, expansion.around(frames.global_from_frame[:, :2, 3], _REACH))
+
+
+def scene_outline(folder: Path, name: str) -> LogOutline:
+    """Return the key frames of a scene as `read_scene` does, without map and boxes; raises UserError like it."""
+    tables = _tables(folder)
+    scene = tables.scenes()[name]
+    return LogOutline(name, "nuscenes", tables.location(scene), key_frames(scene_frames(tables, scene)))
 
 
 @functools.lru_cache(maxsize=1)

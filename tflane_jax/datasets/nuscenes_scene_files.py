@@ -14,7 +14,6 @@ Global metres; no pickle inside.
 from __future__ import annotations
 
 import json
-import zipfile
 import zlib
 from collections.abc import Mapping
 from dataclasses import replace
@@ -25,11 +24,13 @@ import numpy as np
 from jaxtyping import Float
 
 from tflane_jax.datasets.lane_outlines import LaneOutline, boundaries
+from tflane_jax.datasets.log_frames import LogOutline
 from tflane_jax.datasets.nuscenes_log import CATEGORIES, empty_tracks, road_user, side_of
 from tflane_jax.datasets.nuscenes_map import flat
 from tflane_jax.datasets.plausible import LONGEST, SHORTEST, check_distance, check_motion, check_place
 from tflane_jax.errors import UserError
 from tflane_jax.files.fields import member, numbers, shown
+from tflane_jax.files.npz import read_npz
 from tflane_jax.geometry import invert_pose, transform_points, yaw_pose
 from tflane_jax.scene import LineType, RoadUser
 from tflane_jax.scene.logs import KeyFrame, LaneSegment, Log, Tracks, VectorMap
@@ -54,38 +55,50 @@ def read_scene_file(path: Path, *, categories: Mapping[str, RoadUser | None] = C
     """
     path = Path(path)
     content = _content(path)
-    name, period_ns, area = _meta(content["meta"], f"{path}: meta")
-    x, y, _ = content["ego_position"].T
-    pose = yaw_pose(x, y, content["ego_yaw"])
-    times = np.arange(len(pose), dtype=np.int64) * period_ns
-    check_motion(content["ego_position"][:, :2], times, [f"{path}: ego_position[{i}]" for i in range(len(pose))])
+    outline = _outline(content, path)
+    times = np.array([moment.timestamp_ns for moment in outline.keyframes], np.int64)
+    pose = np.stack([moment.global_from_ego for moment in outline.keyframes])
     vector_map = _vector_map(content, path)
     lanes = [lane.centerline for lane in vector_map.segments.values()]
     check_place(lanes, content["ego_position"][:, :2], str(path))
     tracks = _tracks(content, pose, categories, path)
     return Log(
-        name=name,
-        source="nuscenes-scenes",
-        map=replace(vector_map, side=side_of(area)),
+        name=outline.name,
+        source=outline.source,
+        map=replace(vector_map, side=side_of(outline.area)),
         timestamps_ns=times,
         global_from_ego=pose,
         tracks=tracks,
         actors=tracks,
-        keyframes=tuple(KeyFrame(int(time), pose[i], i) for i, time in enumerate(times)),
-        seed=zlib.crc32(name.encode()),
-        area=area,
+        keyframes=outline.keyframes,
+        seed=zlib.crc32(outline.name.encode()),
+        area=outline.area,
     )
+
+
+def scene_file_outline(path: Path) -> LogOutline:
+    """Return the key frames of a scene as `read_scene_file` does, without map and boxes; raises UserError like it."""
+    return _outline(read_npz(path, ("ego_position", "ego_yaw", "meta")), path)
+
+
+def _outline(content: Mapping[str, Any], path: Path) -> LogOutline:
+    where = str(path)
+    name, period_ns, area = _meta(member(content, "meta", where), f"{path}: meta")
+    position = numbers(member(content, "ego_position", where), (None, 3), f"{path}: ego_position").astype(np.float64)
+    if not len(position):
+        raise UserError(f"{path}: ego_position holds no key frame")
+    yaw = numbers(member(content, "ego_yaw", where), (len(position),), f"{path}: ego_yaw").astype(np.float64)
+    times = np.arange(len(position), dtype=np.int64) * period_ns
+    check_motion(position[:, :2], times, [f"{path}: ego_position[{i}]" for i in range(len(position))])
+    x, y, _ = position.T
+    poses = zip(times.tolist(), yaw_pose(x, y, yaw), strict=True)
+    keyframes = tuple(KeyFrame(time, pose, i) for i, (time, pose) in enumerate(poses))
+    return LogOutline(name, "nuscenes-scenes", area, keyframes)
 
 
 def _content(path: Path) -> dict[str, Any]:
     """Return the checked arrays of a file: numbers are finite, and sizes fit."""
-    try:
-        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
-            content = {key: file[key] for key in file.files}
-    except OSError as error:
-        raise UserError(f"cannot read {path}: {error.strerror or error}") from None
-    except (ValueError, TypeError, zipfile.BadZipFile, EOFError, zlib.error) as error:
-        raise UserError(f"{path} is no npz file of plain arrays ({error})") from None
+    content: dict[str, Any] = dict(read_npz(path))
     where = str(path)
     for key in _TEXTS:
         if np.asarray(member(content, key, where)).dtype.kind != "U" or content[key].ndim != 1:

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
-from tflane_jax.datasets.base import ExampleConfig, FrameInfo, Split
+from tflane_jax.datasets.base import SPLITS, ExampleConfig, FrameInfo, Split
 from tflane_jax.datasets.data_source import Choice, DataSource, FolderCheck
 from tflane_jax.datasets.examples import make_example
-from tflane_jax.datasets.nuscenes_scene_files import find_scene_files, read_scene_file
+from tflane_jax.datasets.log_frames import LogFrames
+from tflane_jax.datasets.nuscenes_scene_files import find_scene_files, read_scene_file, scene_file_outline
 from tflane_jax.datasets.nuscenes_splits import official_split
 from tflane_jax.datasets.overlap import frame_drives
 from tflane_jax.datasets.streaming import StreamingConfig
 from tflane_jax.errors import UserError
 from tflane_jax.scene import Example
+from tflane_jax.scene.logs import Log
 
 NUSCENES_SIZES = ExampleConfig(lanes=64, segments=96, areas=32, tracks=160)
 """Capacities of an example; the most in seven scenes were 40 centerlines, 61 segments, 10 areas and 103 road users."""
@@ -39,7 +43,10 @@ class SceneFileConfig:
 class SceneFileDataset:
     """Key frames of scene files, sorted by file name, then time.
 
-    Raises UserError where there is no file, one cannot be read, or a named scene is missing.
+    Maps and boxes are read when an example needs them, see `LogFrames`.
+
+    Raises UserError where there is no file, the poses of one cannot be read, or a named scene is missing. `example`
+    raises it for damaged boxes or a damaged map.
     """
 
     name = "nuscenes-scenes"
@@ -49,8 +56,8 @@ class SceneFileDataset:
         files = {path.stem: path for path in find_scene_files(config.root)}
         if missing := set(config.scenes) - set(files):
             raise UserError(f"{config.root} has no scene {min(missing)}, only {', '.join(files)}")
-        self.logs = tuple(read_scene_file(path) for name, path in files.items() if name in (config.scenes or files))
-        self._frames = [(log, i) for log in self.logs for i in range(len(log.keyframes))]
+        chosen = [path for name, path in files.items() if name in (config.scenes or files)]
+        self._frames = LogFrames(list(map(scene_file_outline, chosen)), partial(_read, chosen))
 
     def __len__(self) -> int:
         return len(self._frames)
@@ -62,9 +69,11 @@ class SceneFileDataset:
 
     def info(self, index: int) -> FrameInfo:
         """Return scene, time (from the scene's start) and pose of one example."""
-        log, number = self._frames[index]
-        moment = log.keyframes[number]
-        return FrameInfo(log.source, log.name, moment.timestamp_ns, moment.global_from_ego, log.area)
+        return self._frames.info(index)
+
+
+def _read(files: Sequence[Path], row: int) -> Log:
+    return read_scene_file(files[row])
 
 
 @dataclass(frozen=True)
@@ -112,10 +121,12 @@ def _choose(choice: Choice) -> SceneFileConfig:
     example = replace(choice.configured.example, cameras=None)
     if not choice.split_given:
         return SceneFileConfig(choice.root, example=example)
-    names = [path.stem for path in find_scene_files(choice.root)]
-    chosen = tuple(name for name in names if official_split(name, mini=False) == choice.split)
+    splits = {path.stem: official_split(path.stem, mini=False) for path in find_scene_files(choice.root)}
+    chosen = tuple(name for name, split in splits.items() if split == choice.split)
     if not chosen:
-        raise UserError(f"{choice.root} has no scene of nuScenes' split {choice.split}: leave --split out to take all")
+        there = " or ".join(split for split in SPLITS if split in splits.values())
+        remedy = f"{choice.option} {there}" + (", or leave it out to take all" if choice.option == "--split" else "")
+        raise UserError(f"{choice.root} has no scene of nuScenes' split {choice.split}: choose {remedy}")
     return SceneFileConfig(choice.root, chosen, example)
 
 

@@ -6,16 +6,18 @@ others.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 from tflane_jax.datasets.base import ExampleConfig, FrameInfo, Split
 from tflane_jax.datasets.data_source import Choice, DataSource
 from tflane_jax.datasets.examples import make_example
+from tflane_jax.datasets.log_frames import LogFrames
 from tflane_jax.datasets.overlap import frame_drives
 from tflane_jax.datasets.procedural import REAL_LIKE_EXAMPLE
-from tflane_jax.datasets.road_maps import chosen_maps
+from tflane_jax.datasets.road_maps import MapFile, chosen_maps
 from tflane_jax.datasets.streaming import StreamingConfig
 from tflane_jax.scene import Example
 from tflane_jax.scene.logs import Log
@@ -48,7 +50,10 @@ class RecordedConfig:
 class RecordedDataset:
     """Key frames of recorded logs, sorted by log, then time.
 
-    Raises UserError where there is no log, a named one is missing, or one cannot be read.
+    Maps and boxes are read when an example needs them, see `LogFrames`.
+
+    Raises UserError where there is no log, a named one is missing, or the times and poses of one cannot be read.
+    `example` raises it for damaged boxes or a damaged map.
     """
 
     name = "recorded"
@@ -56,8 +61,8 @@ class RecordedDataset:
     def __init__(self, config: RecordedConfig):
         self.config = config
         found = chosen_maps(config.root, config.logs, config.without)
-        self.logs = tuple(one.log() for one in found if one.recorded or config.logs)
-        self._frames = [(log, i) for log in self.logs for i in range(len(log.keyframes))]
+        logs = [one for one in found if one.recorded or config.logs]
+        self._frames = LogFrames([one.outline() for one in logs], partial(_read, logs))
         self._giver = chosen_maps(config.root, (config.traffic,))[0].log() if config.traffic else None
 
     def __len__(self) -> int:
@@ -74,13 +79,15 @@ class RecordedDataset:
 
     def info(self, index: int) -> FrameInfo:
         """Return log, time and pose of one example."""
-        log, number = self._frames[index]
-        moment = log.keyframes[number]
-        return FrameInfo(log.source, log.name, moment.timestamp_ns, moment.global_from_ego, log.area)
+        return self._frames.info(index)
 
     def drives(self) -> Iterator[Log]:
         """Yield the logs."""
-        yield from self.logs
+        return self._frames.logs()
+
+
+def _read(logs: Sequence[MapFile], row: int) -> Log:
+    return logs[row].log()
 
 
 @dataclass(frozen=True)

@@ -14,11 +14,12 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from tflane_jax.datasets.argoverse2_log import ANNOTATIONS, POSES, load_log
+from tflane_jax.datasets.argoverse2_log import ANNOTATIONS, POSES, load_log, log_outline
 from tflane_jax.datasets.argoverse2_map import MAP_PATTERN
 from tflane_jax.datasets.geojson_lanes import read_lanes
-from tflane_jax.datasets.nuscenes_place import SCENE_TABLE, read_scene, scene_files
-from tflane_jax.datasets.nuscenes_scene_files import read_scene_file
+from tflane_jax.datasets.log_frames import LogOutline
+from tflane_jax.datasets.nuscenes_place import SCENE_TABLE, read_scene, scene_files, scene_outline
+from tflane_jax.datasets.nuscenes_scene_files import read_scene_file, scene_file_outline
 from tflane_jax.datasets.openlane_maps import map_name, read_segment, segment_files
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import pose_yaw, transform_points
@@ -70,11 +71,23 @@ class MapFile:
 
     def log(self) -> Log:
         """Read the log; raise UserError if a file is missing or damaged, or if the map is not that of a log."""
-        if not self.recorded:
-            raise UserError(f"{self.files[0]} is a map without a recording: name a log")
+        self._check_recorded()
         if self.kind == "nuscenes":
             return read_scene(self.files[0].parent, self.name)
         return load_log(self.files[0].parent) if self.kind == "argoverse2" else read_scene_file(self.files[0])
+
+    def outline(self) -> LogOutline:
+        """Read the key frames of the log, without map and boxes; raises UserError as `log` does."""
+        self._check_recorded()
+        if self.kind == "nuscenes":
+            return scene_outline(self.files[0].parent, self.name)
+        if self.kind == "argoverse2":
+            return log_outline(self.files[0].parent)
+        return scene_file_outline(self.files[0])
+
+    def _check_recorded(self) -> None:
+        if not self.recorded:
+            raise UserError(f"{self.files[0]} is a map without a recording: name a log")
 
     def read(self) -> RoadMap:
         """Read the map; raise UserError if a file is missing or damaged."""

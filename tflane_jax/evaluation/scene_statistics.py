@@ -19,15 +19,15 @@ FRAME_QUANTITIES = (
     "crossings",
     "road boundaries",
     "lanes beside the vehicle",
-    "- oncoming",
+    "oncoming lanes beside the vehicle",
     "vehicle on a connector",
     "oblique fraction of lane length",
 )
 """One value for each frame; those of road users follow, see `evaluation.example_statistics`.
 
-Lanes beside the vehicle go its way, or against it, up to 45 degrees aside, where they pass it; its own counts too.
-The vehicle is on a connector (1, else 0) if that is the nearest lane. Oblique are pieces of lanes at 15 to 75 degrees
-from the vehicle's axis.
+Lanes beside the vehicle go its way, up to 45 degrees aside, where they pass it; its own counts too. Oncoming ones go
+against it and are counted apart. The vehicle is on a connector (1, else 0) if that is the nearest lane. Oblique are
+pieces of lanes at 15 to 75 degrees from the vehicle's axis.
 """
 LANE_QUANTITIES = (
     "length, m",
@@ -119,7 +119,7 @@ def _around_the_vehicle(lanes: LaneGraph) -> dict[str, float]:
     oblique = (np.abs(ahead) > _OBLIQUE[1]) & (np.abs(ahead) < _OBLIQUE[0])
     return {
         "lanes beside the vehicle": (passes & (ahead > _ALONG)).any(-1).sum(),
-        "- oncoming": (passes & (ahead < -_ALONG)).any(-1).sum(),
+        "oncoming lanes beside the vehicle": (passes & (ahead < -_ALONG)).any(-1).sum(),
         "vehicle on a connector": float(on_connector),
         "oblique fraction of lane length": (metres * oblique).sum() / max(metres.sum(), 1e-6),
     }

@@ -19,6 +19,8 @@ from tflane_jax.scene import LaneGraph
 
 # Cells up to this distance from a lane, in cells, learn offset and direction: bilinear sampling near a lane reads them.
 _RADIUS = 1.5
+# Squared length of a piece, in cells, below which its ends count as one point.
+_NO_LENGTH = 1e-9
 
 
 class LaneCells(NamedTuple):
@@ -41,7 +43,7 @@ def lane_cells(lanes: LaneGraph, shape: tuple[int, int], range_: PerceptionRange
     """Return the targets of all cells from the valid lanes of one example.
 
     Args:
-        lanes: ground truth; padding may hold anything.
+        lanes: ground truth; padding may hold anything. A lane may repeat points; one of a single place counts as none.
         shape: rows (along y) and columns (along x) of the grid.
         range_: the box that the grid covers, metres.
     """
@@ -50,12 +52,14 @@ def lane_cells(lanes: LaneGraph, shape: tuple[int, int], range_: PerceptionRange
     points = jnp.where(lanes.valid[:, None, None], lanes.points, 0.0)
     unit = range_.normalise(points)[..., :2] * count[None, None]  # in cells
     begin, step = unit[:, :-1].reshape(-1, 2), (unit[:, 1:] - unit[:, :-1]).reshape(-1, 2)  # (S, 2)
-    valid = jnp.repeat(lanes.valid, points.shape[1] - 1)
+    squares = (step**2).sum(-1)
+    # A piece between equal points has no direction; its neighbours cover its place.
+    valid = jnp.repeat(lanes.valid, points.shape[1] - 1) & (squares > _NO_LENGTH)
+    squares = jnp.maximum(squares, _NO_LENGTH)
     if not len(begin):
         nothing = jnp.zeros((h, w), bool)
         return LaneCells(nothing, nothing, jnp.zeros((h, w, 2)), jnp.zeros((h, w, 2)))
     column, row = jnp.meshgrid(jnp.arange(w) + 0.5, jnp.arange(h) + 0.5)
-    squares = jnp.maximum((step**2).sum(-1), 1e-9)
 
     def compare(i: Int[Array, ""], best: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
         squared, apart, x, y, nearest = best

@@ -12,9 +12,7 @@ where lines may have different numbers of points.
 
 from __future__ import annotations
 
-import math
 import reprlib
-import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,11 +21,10 @@ import numpy as np
 
 from tflane_jax.errors import UserError
 from tflane_jax.files.fields import choices, fractions, is_text, items, line_points, load_file, member, scores
+from tflane_jax.files.npz import read_npz
 from tflane_jax.metrics.frames import LaneDetections, LaneTruth
 
 SUFFIXES = (".npz", ".json")
-# Bytes of memory that a file's arrays may take: 200 frames of 10,000 lanes of 200 points are 10 GB.
-_MOST_MEMORY = 2**34
 
 
 class PlainKey(NamedTuple):
@@ -94,7 +91,7 @@ def _shown(value: Any) -> str:
 
 def _npz_records(path: Path) -> Iterator[dict[str, Any]]:
     """Return the frames of a file of arrays, without the empty slots."""
-    arrays = _arrays(path)
+    arrays = read_npz(path)
     points = member(arrays, "points", str(path))
     if points.ndim != 4:
         raise UserError(f"{path}: points has shape {points.shape}, expected (frames, lanes, points, 3)")
@@ -115,43 +112,6 @@ def _npz_records(path: Path) -> Iterator[dict[str, Any]]:
         if "successor" in record:
             record["successor"] = record["successor"][np.ix_(valid[f], valid[f])]
         yield record
-
-
-def _arrays(path: Path) -> dict[str, np.ndarray]:
-    """Return the arrays of an .npz file, whose sizes are checked before memory is taken for them."""
-    try:
-        with path.open("rb") as stream:
-            if not zipfile.is_zipfile(stream):
-                raise ValueError("no archive")  # numpy reads other kinds of files too
-            stream.seek(0)
-            parts = zipfile.ZipFile(stream).infolist()
-            if len({part.filename for part in parts}) < len(parts):
-                raise ValueError("an array is there twice")
-            if (needed := sum(part.file_size for part in parts)) > _MOST_MEMORY:
-                raise ValueError(f"its arrays claim {needed:.2g} bytes")
-            with zipfile.ZipFile(stream) as archive:
-                for part in parts:
-                    _check_size(archive, part)
-            stream.seek(0)
-            with np.load(stream, allow_pickle=False) as file:
-                return {name: file[name] for name in file.files}
-    except OSError as error:
-        raise UserError(f"cannot read {path}: {error.strerror or error}") from None
-    # A damaged archive may raise any error of zipfile, zlib, numpy or the parser of its headers.
-    except Exception as error:
-        raise UserError(f"{path} is no .npz file of plain arrays, or it is damaged ({error})") from None
-
-
-def _check_size(archive: zipfile.ZipFile, part: zipfile.ZipInfo) -> None:
-    """Raise ValueError if the header of an array claims another size than the file has for it."""
-    with archive.open(part) as content:
-        version = np.lib.format.read_magic(content)
-        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-        shape, _, dtype = read(content)
-        claimed = math.prod(shape) * dtype.itemsize
-        if not dtype.hasobject and claimed != part.file_size - content.tell():
-            has = f"but the file has {part.file_size - content.tell()} for it"
-            raise ValueError(f"{part.filename} claims {claimed:.2g} bytes, {has}")
 
 
 def _lines(record: Any, where: str) -> list[np.ndarray]:

@@ -12,8 +12,9 @@ _Run = tuple[object, ...]
 def core_minutes(tables: Iterable[PaperTable]) -> float:
     """Return the minutes that the updates of all runs take on one core; runs that tables share count once.
 
-    Runs are equal here if their rows refer to the same configuration, settings, steps, host and seed. Loading no
-    configuration, this misses equal ones that are written differently.
+    Of different figures that tables give for a run, the highest counts, so that no table costs more than all together.
+    Runs are equal here if their rows refer to the same configuration, settings, steps, host and seed: no configuration
+    is loaded. A test holds that equal ones are written alike.
     """
     found: dict[_Run, float] = {}
     for table in tables:

@@ -11,10 +11,7 @@ from tests.shared import ROOT
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 MOST_BYTES = 600_000
 
-# Each follows the cell of parameters. Models that are too small to be any good: one notebook gets random weights, the
-# other a training of two updates.
-SMALL = {
-    "traffic_flow": """
+RANDOM_WEIGHTS = """
 from tests.parameters import random_params
 from tflane_jax.runs import save_weights
 
@@ -24,8 +21,15 @@ settings = "--task.model.decoder.layers 1 --task.model.encoder.levels 32"
 
 def train_run(config, folder, start):
     assert start == "new"
-    save_weights(config, random_params(config.task.init, config.task.shapes(config.data)), folder)
-""",
+    example = config.task.shapes(config.data)
+    if config.task.clip > 1:  # only the shapes count, and those of a clip have one axis more
+        example = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct((1, *leaf.shape), leaf.dtype), example)
+    save_weights(config, random_params(config.task.init, example), folder)
+"""
+# Each follows the cell of parameters. Models that are too small to be any good: random weights, or two updates.
+SMALL = {
+    "traffic_flow": RANDOM_WEIGHTS,
+    "markers": RANDOM_WEIGHTS,
     "masking": """
 folder, scenes, rounds = Path({folder!r}), 2, 2
 settings = "--training.steps 2 --training.log-every 1 --training.eval-every 2 --optim.warmup-steps 1"
@@ -34,7 +38,9 @@ settings += " --task.model.decoder.layers 1 --task.model.encoder.levels 32"
 runs = {{"joint": "tf_lane/masking:joint"}}
 """,
 }
-PICTURES = {"traffic_flow": 6, "masking": 4}
+PICTURES = {"traffic_flow": 6, "masking": 4, "markers": 4}
+# Of the two scenes of a small run.
+FRAMES = {"traffic_flow": 8, "masking": 8, "markers": 16}
 
 
 @pytest.fixture(params=NOTEBOOKS, ids=lambda path: path.stem)
@@ -57,7 +63,7 @@ def test_notebook_runs(notebook, tmp_path, monkeypatch):
             cell.outputs = []
     client.NotebookClient(notebook, timeout=300, resources={"metadata": {"path": str(ROOT)}}).execute()
     assert pictures(notebook) >= PICTURES[name]
-    assert "8 validation frames of 2 scenes" in printed(notebook)
+    assert f"{FRAMES[name]} validation frames of 2 scenes" in printed(notebook)
 
 
 def test_functions_that_notebooks_call_exist_and_take_their_arguments(notebook):

@@ -10,6 +10,7 @@ import pytest
 from tests.models.cases import BASELINE, make_example
 from tests.parameters import random_params, zero_params
 from tflane_jax.geometry import PerceptionRange
+from tflane_jax.limits import SettingError
 from tflane_jax.models.bevformer_detr import BevFormerDetrConfig
 from tflane_jax.models.lane_proposals import LaneProposals, best_cells, jittered_middles, lane_middles
 from tflane_jax.models.lane_queries import LaneDecoderConfig, LaneProposalConfig
@@ -92,6 +93,12 @@ def test_queries_lie_on_the_lanes_of_their_cells_and_the_shape_head_sees_the_tru
     for one, other in zip(jax.tree.leaves(clean), jax.tree.leaves(dirty), strict=True):
         np.testing.assert_array_equal(one, other)
     assert clean["auxiliary"]["lane_proposals"][0].lanes.shape == (4, 5, 3)
+
+
+def test_more_proposals_than_cells_and_bins_are_refused():
+    config = LaneDecoderConfig(queries=99, proposals=LaneProposalConfig(count=13, headings=2))
+    with pytest.raises(SettingError, match=r"proposals\.count is 13: .* at most 12: .* 2 x 3 cells, 2 headings"):
+        jax.eval_shape(LaneProposals(config, PerceptionRange()).init, jax.random.key(0), jnp.zeros((2, 3, 8)), None)
 
 
 def test_an_untrained_shape_head_proposes_straight_lanes_along_the_bin():

@@ -133,7 +133,7 @@ class CenterlineMetrics:
         result |= self._topology("TOP_lt", self._element_topology, self._element_vertices)
         for suffix in self._suffixes():
             lanes, elements = (result.get(name + suffix) for name in ("TOP_ll", "TOP_lt"))
-            if lanes is not None and elements is not None:
+            if lanes is not None and elements is not None:  # marker paper, Eq. (5)
                 result["OLS" + suffix] = float(np.mean([result["DET_l"], result["DET_t"], lanes**0.5, elements**0.5]))
         return result
 

@@ -20,6 +20,7 @@ from jaxtyping import Array, Float, Int
 from tflane_jax.geometry import BevGrid, PerceptionRange
 from tflane_jax.geometry.pillars import cell_points
 from tflane_jax.layers.graph import Mlp
+from tflane_jax.limits import SettingError
 from tflane_jax.models.auxiliary import AUXILIARY, LaneProposalOutputs
 from tflane_jax.models.lane_decoder import smooth_basis
 from tflane_jax.models.lane_queries import LaneDecoderConfig, LaneProposalConfig
@@ -51,9 +52,15 @@ class LaneProposals(nn.Module):
         Args:
             bev: BEV features, row 0 at the smallest y, column 0 at the smallest x.
             lanes: ground truth near which the shape head is trained; not used otherwise.
+
+        Raises:
+            SettingError: more proposals than cells and bins.
         """
         config, proposals = self.config, _proposals(self.config)
         h, w, _ = bev.shape
+        if proposals.count > (most := h * w * proposals.headings):
+            allowed = f"at most {most}: BEV features of {h} x {w} cells, {proposals.headings} headings each"
+            raise SettingError("task.model.decoder.proposals.count", proposals.count, allowed)
         x = nn.Conv(proposals.hidden, (3, 3), name="conv")(bev)
         x = nn.relu(nn.LayerNorm(epsilon=1e-5, name="norm")(x))
         # Bias -log 99: the initial probability is 0.01 (focal loss prior, Lin et al. 2017).

@@ -194,7 +194,7 @@ def test_a_full_disk_is_a_message_and_leaves_nothing(tmp_path, state, monkeypatc
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_write_that_the_system_refuses_is_one_message(tmp_path, capfd, monkeypatch):
+def test_a_write_that_the_system_refuses_is_one_message(tmp_path, state, capfd, monkeypatch):
     resource = pytest.importorskip("resource")
     monkeypatch.setattr("sys.unraisablehook", lambda found: print(f"thread: {found.exc_value}", file=sys.stderr))
     large = {f"layer_{i}": np.random.default_rng(i).random(50_000, np.float32) for i in range(20)}
@@ -203,7 +203,7 @@ def test_a_write_that_the_system_refuses_is_one_message(tmp_path, capfd, monkeyp
     try:
         resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, limits[1]))  # of a file, bytes
         with pytest.raises(UserError) as caught:
-            Checkpoints(tmp_path).save(None, Manifest(step=1, config=CONFIG))
+            Checkpoints(tmp_path).save(state, Manifest(step=1, config=CONFIG))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     time.sleep(0.5)  # threads that report late

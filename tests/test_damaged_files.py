@@ -22,7 +22,7 @@ from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import write_json
 from tflane_jax.runs import open_run, resumable_config
 from tflane_jax.tasks.lane_graph import LaneGraphTask
-from tflane_jax.training import checkpoint, provenance
+from tflane_jax.training import array_files, checkpoint, provenance, run_folder
 from tflane_jax.training.checkpoint import Checkpoints, Manifest
 from tflane_jax.training.loop import _carried
 from tflane_jax.training.records import RecordWriter, read_records
@@ -255,7 +255,7 @@ def test_a_checkpoint_that_cannot_be_written_leaves_the_earlier_ones(whole, tmp_
     (state,) = init_states(LineTask(), make_optimizer(OptimConfig(warmup_steps=0), 9), (0,), example)
     restored = checkpoints.restore(2, state)
     with monkeypatch.context() as patch:
-        patch.setattr(checkpoint, "_checkpointer", Full)
+        patch.setattr(array_files, "_checkpointer", Full)
         with pytest.raises(UserError, match=r"step_00000003: .*(space left|Read-only).*--resume"):
             checkpoints.save(restored, Manifest(step=3, config={}))
     assert sorted(path.name for path in (run / "checkpoints").iterdir()) == ["step_00000001", "step_00000002"]
@@ -302,3 +302,6 @@ def test_run_folders_that_cannot_be_used_are_told_before_any_work(tmp_path, caps
     for out in (tmp_path / "file", tmp_path / "file" / "run"):
         assert main(["train", "--config", "tf_lane/toponet", "--out", str(out)]) == 2
         assert f"{tmp_path / 'file'} is no folder" in capsys.readouterr().err
+    with run_folder.claimed(tmp_path / "used", "new"):
+        assert main(["train", "--config", "tf_lane/toponet", "--out", str(tmp_path / "used")]) == 2
+    assert f"another process is training into {tmp_path / 'used'}" in capsys.readouterr().err

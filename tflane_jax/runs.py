@@ -41,7 +41,7 @@ from tflane_jax.training.fine_tuning import check_origins
 from tflane_jax.training.loop import Draw, TrainingResult, train
 from tflane_jax.training.provenance import add_provenance
 from tflane_jax.training.records import Record
-from tflane_jax.training.run_folder import Start, check_start, claimed, read_config
+from tflane_jax.training.run_folder import Start, check_start, check_unchanged, claimed, read_config
 from tflane_jax.training.schedule import make_optimizer, scaled_to_batch
 from tflane_jax.training.state import per_seed, state_of
 
@@ -71,12 +71,15 @@ def train_run(config: RunConfig, folder: Path, *, start: Start = "new", progress
 
     Raises UserError like `training.loop.train` and the datasets, and `Interrupted` like that.
     """
-    from_first(lambda: check_start(folder, start))  # before building data, which may take long
+    # All this before building data, which may take long.
+    from_first(lambda: check_start(folder, start))
     with agreed():
         check_run(config)
         training_mesh(config.training.batch_size, config.training.accumulate)
         check_rate_factors(config)
-    if start != "resume":
+    if start == "resume":
+        from_first(lambda: check_unchanged(folder, to_json(config), current_form))
+    else:
         from_first(lambda: check_origin(config))
     with showing(progress and is_first()):
         return _train(config, folder, start=start, progress=progress)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tflane_jax.errors import UserError
-from tflane_jax.plots.curves import curves, save_curves
+from tflane_jax.plots.curves import curves, save_comparison_curves, save_curves
 
 pytest.importorskip("matplotlib")
 from matplotlib.figure import Figure
@@ -30,10 +30,15 @@ def test_values_are_sorted_by_split_name_step_and_seed():
     np.testing.assert_array_equal(series["val", "all/DET_l"][1], [[0.1, 0.3]])
 
 
-def test_a_panel_holds_a_group_and_a_band_holds_the_seeds(tmp_path, monkeypatch):
-    figures = []
-    savefig = Figure.savefig
-    monkeypatch.setattr(Figure, "savefig", lambda self, *a, **k: (figures.append(self), savefig(self, *a, **k)))
+@pytest.fixture
+def figures(monkeypatch):
+    """The figures that were saved."""
+    saved, savefig = [], Figure.savefig
+    monkeypatch.setattr(Figure, "savefig", lambda self, *a, **k: (saved.append(self), savefig(self, *a, **k)))
+    return saved
+
+
+def test_a_panel_holds_a_group_and_a_band_holds_the_seeds(tmp_path, figures):
     records = [*RECORDS, {"step": 30, "split": "val", "all/DET_l": [0.4, 0.6], "occluded/DET_l": [0.1, 0.3]}]
     assert save_curves(tmp_path / "curves.png", records).stat().st_size > 2000
     drawn = [ax for ax in figures[0].axes if ax.axison]
@@ -48,6 +53,36 @@ def test_a_panel_holds_a_group_and_a_band_holds_the_seeds(tmp_path, monkeypatch)
     np.testing.assert_allclose(drawn[2].lines[0].get_ydata(), [0.2, 0.5])
     heights = drawn[2].collections[0].get_paths()[0].vertices[:, 1]
     assert (heights.min(), heights.max()) == (0.1, 0.6)
+
+
+def test_legends_lie_beside_the_curves(tmp_path, figures):
+    names = [f"loss/{name}" for name in "abcdefghi"]
+    save_curves(tmp_path / "curves.png", [{"step": 1, "split": "train"} | dict.fromkeys(names, 1.0)])
+    (ax,) = figures[0].axes
+    assert ax.get_legend().get_window_extent().x0 >= ax.get_window_extent().x1
+    assert len(ax.get_legend().get_texts()) == 9
+
+
+def test_scores_have_a_linear_axis_and_those_of_single_thresholds_are_left_out(tmp_path, figures):
+    low, high = ({"all/recall": v, "all/recall@1.0": v} for v in (0.001, 0.5))
+    save_curves(tmp_path / "curves.png", [{"step": 1, "split": "val"} | low, {"step": 2, "split": "val"} | high])
+    (ax,) = figures[0].axes
+    assert ax.get_yscale() == "linear"
+    assert [line.get_label() for line in ax.lines] == ["recall"]
+    assert all(tick == round(tick) for tick in ax.get_xticks())
+
+
+def test_a_model_has_one_colour_in_all_panels(tmp_path, figures):
+    lanes, segments = ([[{"step": 1, "split": "val"} | scores]] for scores in ({"a": 1.0, "b": 0.001}, {"b": 0.5}))
+    save_comparison_curves(tmp_path / "curves.png", {"segments": segments, "lanes": lanes}, ["a", "b"])
+    first, second = figures[0].axes
+    colours = {line.get_label(): line.get_color() for line in second.lines}
+    assert len(set(colours.values())) == 2
+    assert first.lines[0].get_color() == colours["lanes"]
+    (legend,) = figures[0].legends
+    shown = dict(zip([text.get_text() for text in legend.get_texts()], legend.get_lines(), strict=True))
+    assert {name: line.get_color() for name, line in shown.items()} == colours
+    assert legend.get_window_extent().y1 <= second.get_window_extent().y0
 
 
 @pytest.mark.parametrize("records", [RECORDS[:1], [{"step": 1, "a": float("nan")}]])

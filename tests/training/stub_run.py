@@ -46,7 +46,7 @@ def main() -> None:
 
         def die_while_writing(writing):
             # The state is on disk, the manifest is not.
-            if ".writing" in writing.name and int(checkpoint._load_tree(writing / "state")["step"]) == int(step):
+            if ".writing" in writing.name and int(checkpoint.load_arrays(writing / "state")["step"]) == int(step):
                 os.kill(os.getpid(), signal.SIGKILL)
             return checksums(writing)
 

@@ -1,6 +1,8 @@
 """Checkpoints: bit-identical round trips, and a clear message for every fault of a folder."""
 
 import json
+import sys
+import time
 
 import jax
 import jax.numpy as jnp
@@ -186,7 +188,25 @@ def test_a_full_disk_is_a_message_and_leaves_nothing(tmp_path, state, monkeypatc
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("tflane_jax.training.checkpoint._save_tree", full)
+    monkeypatch.setattr("tflane_jax.training.checkpoint.save_arrays", full)
     with pytest.raises(UserError, match="No space left on device"):
         saved(tmp_path, state, [(1, None)])
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_write_that_the_system_refuses_is_one_message(tmp_path, state, capfd, monkeypatch):
+    resource = pytest.importorskip("resource")
+    monkeypatch.setattr("sys.unraisablehook", lambda found: print(f"thread: {found.exc_value}", file=sys.stderr))
+    large = {f"layer_{i}": np.random.default_rng(i).random(50_000, np.float32) for i in range(20)}
+    monkeypatch.setattr("tflane_jax.training.checkpoint._plain", lambda _: large)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, limits[1]))  # of a file, bytes
+        with pytest.raises(UserError) as caught:
+            Checkpoints(tmp_path).save(state, Manifest(step=1, config=CONFIG))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    time.sleep(0.5)  # threads that report late
+    assert str(caught.value).startswith(f"cannot write checkpoint {tmp_path / 'step_00000001'}: File too large; make")
+    assert capfd.readouterr().err == ""
     assert list(tmp_path.iterdir()) == []

@@ -3,6 +3,7 @@
 import copy
 import dataclasses
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from tests.training.stub import LineTask, line_arrays
 from tests.training.stub_run import CONFIG, RESOLVED, run, score
 from tflane_jax.datasets.batches import batch_indices
 from tflane_jax.errors import UserError
+from tflane_jax.training import loop
 from tflane_jax.training.checkpoint import Checkpoints
 from tflane_jax.training.provenance import read_provenance, thread_setting
 
@@ -86,3 +88,20 @@ def test_a_checkpoint_is_identified_by_its_content(tmp_path):
     assert first == Checkpoints(tmp_path / "one" / "checkpoints").content(4)
     moved = {"x": line_arrays()["x"] + np.float32(1), "y": line_arrays()["y"]}
     assert content("other", arrays=moved) != first
+
+
+@pytest.mark.parametrize(
+    ("file", "said"),
+    [
+        ("checkpoints/step_00000021/manifest.json", r"step_00000021 is damaged \(manifest\.json"),
+        ("metrics.jsonl", r"metrics\.jsonl is no file of records"),
+    ],
+)
+def test_damage_that_would_end_the_run_later_is_named_before_the_first_step(tmp_path, file, said, monkeypatch):
+    folder = tmp_path / "run"
+    run(folder, config=dataclasses.replace(CONFIG, keep_checkpoints=3))  # those of 21, 28 and 30, and the best
+    shutil.rmtree(folder / "checkpoints" / "step_00000030")
+    (folder / file).write_bytes(b"\xff{")
+    monkeypatch.setattr(loop, "compiled_update", None)
+    with pytest.raises(UserError, match=said):
+        run(folder, start="resume")

@@ -25,7 +25,8 @@ Series = tuple[Int[np.ndarray, " n"], Float[np.ndarray, "n seeds"]]
 def save_curves(path: Path, records: Iterable[Mapping[str, Any]]) -> Path:
     """Write one panel per split and group of values ("loss", "loss/points": group "loss"), and return the path.
 
-    Several seeds are drawn as their mean and a band from minimum to maximum.
+    Several seeds are drawn as their mean and a band from minimum to maximum. Scores at single thresholds
+    ("recall@1.0") are left out. Values of training have a logarithmic axis if they span more than a factor of 30.
 
     Args:
         path: .png, .pdf or .svg.
@@ -33,7 +34,7 @@ def save_curves(path: Path, records: Iterable[Mapping[str, Any]]) -> Path:
 
     Raises UserError without records.
     """
-    series = curves(records)
+    series = {key: values for key, values in curves(records).items() if "@" not in key[1]}
     if not series:
         raise UserError("no curves to draw: the run has no records yet")
     groups: dict[tuple[str, str], list[str]] = {}
@@ -43,7 +44,12 @@ def save_curves(path: Path, records: Iterable[Mapping[str, Any]]) -> Path:
     figure, axes = new_figure(-(-len(groups) // columns), columns, panel=(4.6, 3.2))
     for ax, ((split, group), names) in zip(axes.flat, groups.items(), strict=False):
         ax.set_title(f"{split}: {group}" if split else group, fontsize=9, loc="left")
-        _draw_panel(ax, group, {name.removeprefix(f"{group}/"): series[split, name] for name in names})
+        found = {name.removeprefix(f"{group}/"): series[split, name] for name in names}
+        colours = {name: f"C{number % 10}" for number, name in enumerate(found)}
+        _draw_panel(ax, found, colours, log=split == "train")
+        if list(found) != [group]:
+            # Beside the panel, because there are curves everywhere in it.
+            ax.legend(fontsize=7, frameon=False, loc="upper left", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.0)
     hide_unused(axes, len(groups))
     return save_figure(figure, path)
 
@@ -70,11 +76,16 @@ def save_comparison_curves(
     if not panels:
         return None
     columns = min(3, len(panels))
-    figure, axes = new_figure(-(-len(panels) // columns), columns, panel=(4.6, 3.2))
+    figure, axes = new_figure(-(-len(panels) // columns), columns, panel=(4.6, 3.2), footer=0.1 + 0.1 * len(found))
+    colours = {model: f"C{number % 10}" for number, model in enumerate(found)}  # the same in all panels
     for ax, (name, series) in zip(axes.flat, panels.items(), strict=False):
         ax.set_title(f"validation: {name}", fontsize=9, loc="left")
-        _draw_panel(ax, name, series)
+        _draw_panel(ax, series, colours)
     hide_unused(axes, len(panels))
+    shown = {line.get_label(): line for ax in axes.flat for line in ax.lines}
+    figure.legend(
+        shown.values(), shown, loc="outside lower center", ncols=min(len(shown), 2), fontsize=8, frameon=False
+    )
     return save_figure(figure, path)
 
 
@@ -98,19 +109,18 @@ def curves(records: Iterable[Mapping[str, Any]]) -> dict[tuple[str, str], Series
     }
 
 
-def _draw_panel(ax: Axes, group: str, series: Mapping[str, Series]) -> None:
-    for number, (name, (steps, values)) in enumerate(series.items()):
-        colour = f"C{number % 10}"
+def _draw_panel(ax: Axes, series: Mapping[str, Series], colours: Mapping[str, str], *, log: bool = False) -> None:
+    for name, (steps, values) in series.items():
+        colour = colours[name]
         # A single point needs a marker to be visible.
         ax.plot(steps, values.mean(1), color=colour, lw=1.4, label=name, marker="o" if len(steps) == 1 else "")
         if values.shape[1] > 1:
             ax.fill_between(steps, values.min(1), values.max(1), color=colour, alpha=0.2, lw=0)
     seen = np.concatenate([values.reshape(-1) for _, values in series.values()])
     seen = seen[np.isfinite(seen)]
-    if len(seen) and seen.min() > 0.0 and seen.max() > 30.0 * seen.min():
+    if log and len(seen) and seen.min() > 0.0 and seen.max() > 30.0 * seen.min():
         ax.set_yscale("log")
     ax.set_xlabel("step", fontsize=8)
+    ax.xaxis.get_major_locator().set_params(integer=True)
     ax.tick_params(labelsize=7)
     ax.grid(alpha=0.3, lw=0.5)
-    if list(series) != [group]:
-        ax.legend(fontsize=7, frameon=False)

@@ -20,10 +20,11 @@ from typing import Any, Literal
 import jax
 import numpy as np
 from flax import serialization
-from flax.traverse_util import flatten_dict, unflatten_dict
+from flax.traverse_util import unflatten_dict
 
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import rename_flushed
+from tflane_jax.training.array_files import first_line, flat, load_arrays, save_arrays
 from tflane_jax.training.state import TrainState, state_from, tree_of
 
 _VERSION = 1
@@ -97,7 +98,7 @@ class Checkpoints:
             self.folder.mkdir(parents=True, exist_ok=True)
             for stale in self.folder.glob(".writing-*"):  # left behind by a process that was killed
                 shutil.rmtree(stale, ignore_errors=True)
-            _save_tree(writing / "state", _plain(state))
+            save_arrays(writing / "state", _plain(state))
             content = asdict(manifest) | {"files": _checksums(writing)}
             content["progress"] = {**manifest.progress, _CONFIG_SUM: _sum_of(manifest.config)}
             (writing / "manifest.json").write_text(json.dumps(content, indent=1), encoding="utf-8")
@@ -154,7 +155,7 @@ class Checkpoints:
         """
         saved, shapes = _with_current_names(self.arrays(step)), jax.eval_shape(_plain_tree, template)
         expected = serialization.to_state_dict(shapes)
-        if (difference := _first_difference(saved, _flat(expected))) is not None:
+        if (difference := _first_difference(saved, flat(expected))) is not None:
             raise UserError(
                 f"checkpoint {self.path(step)} does not fit this configuration: {difference}. It was made by another "
                 "model, optimiser or number of seeds: undo the change of config.json (config.txt has the settings "
@@ -174,11 +175,11 @@ class Checkpoints:
             if (found := _checksums(folder)) != manifest.files:
                 wrong = sorted(k for k in found.keys() | manifest.files.keys() if found.get(k) != manifest.files.get(k))
                 raise self._damaged(step, f"{wrong[0]} is not what was written")
-            return _load_tree(folder / "state")
+            return load_arrays(folder / "state")
         except UserError:
             raise
         except Exception as error:  # orbax and tensorstore have many
-            raise self._damaged(step, _first_line(error)) from error
+            raise self._damaged(step, first_line(error)) from error
 
     def params(self, step: int) -> dict[str, Any]:
         """Return the averaged parameters of a checkpoint (leading seed axis where it has several), numpy."""
@@ -224,48 +225,8 @@ class Checkpoints:
         return UserError(f"checkpoint {self.path(step)} is damaged ({why}): delete that folder; {remedy}")
 
 
-# ---------------------------------------------------------------------------------------------------------------------
-# Arrays on disk. Orbax is imported in the functions that need it, because its import takes about a second.
-
-
-def _save_tree(folder: Path, tree: dict[str, np.ndarray]) -> None:
-    import orbax.checkpoint as ocp
-
-    try:
-        with _checkpointer() as writer:
-            writer.save(folder.absolute(), args=ocp.args.PyTreeSave(unflatten_dict(tree, sep="/")))
-    except Exception as error:  # those of orbax and tensorstore for a full disk are no OSError
-        raise error if isinstance(error, OSError) else OSError(_first_line(error)) from error
-
-
-def _checkpointer() -> Any:
-    """Return orbax's reader and writer, for this process alone: it would wait for others that train with it."""
-    import orbax.checkpoint as ocp
-
-    if jax.process_count() == 1:
-        return ocp.Checkpointer(ocp.PyTreeCheckpointHandler())
-    me = jax.process_index()
-    alone = ocp.options.MultiprocessingOptions(
-        primary_host=me, active_processes={me}, barrier_sync_key_prefix=f"process_{me}"
-    )
-    return ocp.Checkpointer(ocp.PyTreeCheckpointHandler(multiprocessing_options=alone), multiprocessing_options=alone)
-
-
-def _load_tree(folder: Path) -> dict[str, np.ndarray]:
-    import orbax.checkpoint as ocp
-
-    with _checkpointer() as reader:
-        names = reader.metadata(folder.absolute()).item_metadata.tree
-        as_numpy = jax.tree.map(lambda _: ocp.RestoreArgs(restore_type=np.ndarray), names)
-        return _flat(reader.restore(folder.absolute(), args=ocp.args.PyTreeRestore(restore_args=as_numpy)))
-
-
 def _sum_of(config: dict[str, Any]) -> int:
     return zlib.crc32(json.dumps(config, sort_keys=True).encode())
-
-
-def _first_line(error: Exception) -> str:
-    return next(iter(str(error).splitlines()), "") or type(error).__name__
 
 
 def _wrong_entry(manifest: Manifest) -> str | None:
@@ -300,7 +261,7 @@ def _plain_tree(state: TrainState) -> dict[str, Any]:
 
 def _plain(state: TrainState) -> dict[str, np.ndarray]:
     words = replace(state, key=jax.random.key_data(state.key))
-    return _flat(serialization.to_state_dict(tree_of(jax.device_get(words))))
+    return flat(serialization.to_state_dict(tree_of(jax.device_get(words))))
 
 
 def _with_current_names(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -318,8 +279,3 @@ def _first_difference(tree: dict[str, Any], expected: dict[str, Any]) -> str | N
         if (here.shape, here.dtype) != (wanted.shape, wanted.dtype):
             return f"{name} is {here.dtype}{list(here.shape)}, not {wanted.dtype}{list(wanted.shape)}"
     return None
-
-
-def _flat(tree: dict[str, Any]) -> dict[str, Any]:
-    """Return the leaves of nested dicts by path; empty dicts vanish."""
-    return flatten_dict(tree, sep="/")  # pyright: ignore[reportReturnType]

@@ -16,7 +16,6 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from tflane_jax.config_io import first_difference
 from tflane_jax.datasets.batches import Prepare, batches, first_example
 from tflane_jax.devices import divided, of_one_process, share, training_mesh
 from tflane_jax.errors import UserError
@@ -31,9 +30,9 @@ from tflane_jax.training.checkpoint import Checkpoints, Manifest
 from tflane_jax.training.fine_tuning import origins, starting_params
 from tflane_jax.training.interrupt import StopRequest
 from tflane_jax.training.provenance import add_provenance
-from tflane_jax.training.records import Record, RecordWriter, Unwritten, Window, seed_record
+from tflane_jax.training.records import Record, RecordWriter, Unwritten, Window, read_records, seed_record
 from tflane_jax.training.restarts import adapt
-from tflane_jax.training.run_folder import Start, claimed, fixed, read_config
+from tflane_jax.training.run_folder import CurrentForm, Start, check_unchanged, claimed
 from tflane_jax.training.schedule import OptimConfig, make_optimizer, scaled_to_batch
 from tflane_jax.training.sharding import placed
 from tflane_jax.training.state import init_states, of_all_seeds, per_seed, state_of
@@ -44,8 +43,6 @@ Evaluate = Callable[[Params], dict[str, float]]
 """Averaged parameters of one seed -> numbers by name."""
 Draw = Callable[[Path, int, Params, list[Record]], None]
 """(run folder, step, averaged parameters of the first seed, all records) -> pictures in the run folder."""
-CurrentForm = Callable[[dict[str, Any]], tuple[dict[str, Any], list[str]]]
-"""Saved configuration (JSON) -> the same in the form of this version, and notices for the user."""
 
 
 @dataclass(frozen=True)
@@ -164,13 +161,8 @@ def train(
         def claim() -> None:
             stack.enter_context(claimed(folder, start))
             if start == "resume":
-                saved, notices = (current_form or _unchanged)(read_config(folder))
-                if difference := first_difference(fixed(saved), fixed(resolved)):
-                    raise UserError(
-                        f"{folder} was started with another configuration ({difference}): "
-                        "resume it as it is, or start another run"
-                    )
-                _print_notices(notices)
+                _print_notices(check_unchanged(folder, resolved, current_form))
+                read_records(folder / "metrics.jsonl")  # if it is damaged, say so before compiling
 
         from_first(claim)
         if count() == 1:
@@ -301,9 +293,9 @@ def train(
 
 def _latest(checkpoints: Checkpoints) -> dict[str, Any] | None:
     """Return step and progress of the latest checkpoint; None if there is none."""
-    if not (steps := checkpoints.steps()):
-        return None
-    return {"step": steps[-1], "progress": checkpoints.manifest(steps[-1]).progress}
+    # All are read, because the next save looks for the best one: a damaged one would end the run there.
+    found = [{"step": step, "progress": checkpoints.manifest(step).progress} for step in checkpoints.steps()]
+    return found[-1] if found else None
 
 
 def _carried(saved: dict[str, Any], fresh: list[Memory]) -> tuple[Window, dict[str, float], float, list[Memory]]:
@@ -324,10 +316,6 @@ def _not_finite(values: dict[str, np.ndarray], step: int, seeds: tuple[int, ...]
         f"step {step + 1}, seed {seeds[bad]}: {what} is not finite. The last good state (step {step}) is kept in "
         f"{kept}. Lower optim.lr or optim.clip_norm and start again, from there with training.init_from"
     )
-
-
-def _unchanged(saved: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
-    return saved, []
 
 
 def _print_notices(notices: Sequence[str]) -> None:

@@ -12,15 +12,18 @@ from __future__ import annotations
 
 import contextlib
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Literal
 
+from tflane_jax.config_io import first_difference
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import check_writable, is_temporary
 from tflane_jax.files.fields import load_json
 
 Start = Literal["new", "resume", "overwrite"]
+CurrentForm = Callable[[dict[str, Any]], tuple[dict[str, Any], list[str]]]
+"""Saved configuration (JSON) -> the same in the form of this version, and notices for the user."""
 _COPY = 'A copy is the entry "config" of checkpoints/step_.../manifest.json: write it there, or start with --overwrite'
 _CONTENT = (
     "config.json",
@@ -57,6 +60,18 @@ def fixed(config: dict[str, Any]) -> dict[str, Any]:
     return config | {"training": training}
 
 
+def check_unchanged(folder: Path, resolved: dict[str, Any], current_form: CurrentForm | None = None) -> list[str]:
+    """Return the notices of `current_form`; raise UserError if a run was started with another configuration (JSON)."""
+    saved, notices = read_config(folder), []
+    if current_form is not None:
+        saved, notices = current_form(saved)
+    if difference := first_difference(fixed(saved), fixed(resolved)):
+        raise UserError(
+            f"{folder} was started with another configuration ({difference}): resume it as it is, or start another run"
+        )
+    return notices
+
+
 @contextlib.contextmanager
 def claimed(folder: Path, start: Start) -> Iterator[None]:
     """Prepare the folder and lock it for this process inside the block.
@@ -84,9 +99,11 @@ def claimed(folder: Path, start: Start) -> Iterator[None]:
 
 
 def check_start(folder: Path, start: Start) -> None:
-    """Raise UserError if the folder does not fit `start`, see `claimed`, or cannot be written. Nothing is written."""
+    """Raise UserError where `claimed` would, as far as can be told beforehand; nothing is written."""
     holds_run = (folder / "config.json").exists()
     check_writable(folder / "run.lock")
+    if is_locked(folder):
+        raise _in_use(folder)
     if start == "new" and holds_run:
         raise UserError(
             f"{folder} already holds a run: continue it with --resume, replace it with --overwrite, "
@@ -117,7 +134,11 @@ def _lock(file: int, folder: Path) -> None:
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError as error:
-        raise UserError(f"another process is training into {folder}: wait for it or choose another folder") from error
+        raise _in_use(folder) from error
+
+
+def _in_use(folder: Path) -> UserError:
+    return UserError(f"another process is training into {folder}: wait for it or choose another folder")
 
 
 def is_locked(folder: Path) -> bool:

@@ -11,9 +11,9 @@ import pytest
 
 from tests.shared import ROOT
 
-PAGES = ("README.md", "docs/tf_lane.md", "docs/small_models.md", "docs/real_roads.md")
+PAGES = ("README.md", "docs/tf_lane.md", "docs/markers.md", "docs/small_models.md", "docs/real_roads.md")
 # The least count of numbers in sentences that must be those of findings; docs/real_roads.md quotes others in brackets.
-FINDINGS = {"README.md": 7, "docs/tf_lane.md": 30, "docs/small_models.md": 0}
+FINDINGS = {"README.md": 7, "docs/tf_lane.md": 30, "docs/markers.md": 12, "docs/small_models.md": 0}
 COLUMNS = {
     "DET_l": "all/DET_l",
     "TOP_ll": "all/TOP_ll",
@@ -22,6 +22,9 @@ COLUMNS = {
     "hidden, driven along": "hidden+traffic/recall",
     "recall, hidden lanes that vehicles drove along": "hidden+traffic/recall",
     "hidden, no vehicle near": "hidden-traffic/recall",
+    "DET_l, occluded lanes": "occluded/DET_l",
+    "recall, board in sight": "seen/recall",
+    "recall, gap": "gap/recall",
 }
 # The same names in tables of vector maps.
 LINE_COLUMNS = {

@@ -43,7 +43,7 @@ FLOORS = (
     "tasks",
     "convert",
     "config",
-    "run_checks",
+    "run_checks training_nearness",
     "runs",
     "summary export",
     "plan",

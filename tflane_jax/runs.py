@@ -9,9 +9,8 @@ import contextlib
 import functools
 import importlib.util
 import sys
-import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +20,8 @@ from flax.errors import FlaxError
 
 from tflane_jax.config import RunConfig
 from tflane_jax.config_io import added_settings, from_json, to_json, to_text
-from tflane_jax.datasets import sources
-from tflane_jax.datasets.base import MissingTracksWarning
 from tflane_jax.datasets.batches import in_workers
 from tflane_jax.datasets.data_source import loading_of
-from tflane_jax.datasets.overlap import Nearness, nearness
 from tflane_jax.datasets.sources import source_of
 from tflane_jax.devices import training_mesh
 from tflane_jax.errors import UserError, install
@@ -255,45 +251,6 @@ def save_weights(config: RunConfig, params: Params, folder: Path, *, part: str |
             state, Manifest(step=0, config=to_json(config), progress={} if part is None else {_PART: part})
         )
         write_json(folder / "config.json", to_json(config))  # last: this file marks a complete run
-
-
-def training_nearness(config: RunConfig, source: Any, root: Path | None = None) -> Nearness | None:
-    """Return how far the examples of a source are from the training frames of a configuration.
-
-    None where one of them shows no real place, and where no example is in a city of the training frames.
-
-    Args:
-        config: of the run.
-        source: of the examples.
-        root: folder of the data set whose training split the model learned, in the format of the source; of Argoverse
-            2, the folder of the training logs; None: the configuration's.
-
-    Raises UserError if the files of the training split cannot be read, or the source has no splits in a folder.
-    """
-    train = config.data.source("train") if root is None else _training_split(source, root)
-    drives = sources.source_of(train).drives
-    if drives is None or sources.source_of(source).drives is None:
-        return None
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", MissingTracksWarning)  # nobody looks at the traffic of these frames
-        trained = [drive for drive in drives(train) if len(drive.positions)]
-    found = nearness(trained, sources.make_dataset(source)) if trained else None
-    return found if found is not None and np.isfinite(found.distances).any() else None
-
-
-def _training_split(source: Any, root: Path) -> Any:
-    """Return the training split of a folder in the format of a source."""
-    named = {one.name for one in fields(source)}
-    # A source with names of its own logs has none of the training split's.
-    if "root" not in named or named & {"logs", "scenes"} or sources.source_of(source).drives is None:
-        raise UserError(
-            f"{sources.source_name(source)} has no training split in a folder: leave out --training-root, which works "
-            "with argoverse2, openlane-v2 and nuscenes"
-        )
-    # Of a data set with splits, the folder's own; of Argoverse 2, all logs in the folder. The logs that tell the
-    # city of OpenLane-V2's frames may be missing.
-    changes = {"root": root, "split": "train", "without_tracks": "empty"}
-    return replace(source, **{name: value for name, value in changes.items() if name in named})
 
 
 def evaluate_run(

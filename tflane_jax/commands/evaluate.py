@@ -24,7 +24,7 @@ from tflane_jax.evaluation.interventions import with_traffic
 from tflane_jax.evaluation.lane_errors import lane_errors
 from tflane_jax.files.atomic import check_stem
 from tflane_jax.plots.tables import format_table, save_table
-from tflane_jax.runs import Run, evaluate_run, training_nearness
+from tflane_jax.runs import Run, evaluate_run
 from tflane_jax.scene import stack_examples
 from tflane_jax.startup import showing, stage
 from tflane_jax.tasks.base import Model, spread
@@ -32,6 +32,7 @@ from tflane_jax.tasks.edge_types import save_edge_types
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.tasks.lane_shape import LaneShapeTask
 from tflane_jax.training.runtime import configure_jax
+from tflane_jax.training_nearness import training_nearness
 
 _IMAGES = 8  # over which a HAN's weights are averaged
 

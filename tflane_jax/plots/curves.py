@@ -110,6 +110,8 @@ def curves(records: Iterable[Mapping[str, Any]]) -> dict[tuple[str, str], Series
 
 
 def _draw_panel(ax: Axes, series: Mapping[str, Series], colours: Mapping[str, str], *, log: bool = False) -> None:
+    from matplotlib.ticker import MaxNLocator
+
     for name, (steps, values) in series.items():
         colour = colours[name]
         # A single point needs a marker to be visible.
@@ -121,6 +123,6 @@ def _draw_panel(ax: Axes, series: Mapping[str, Series], colours: Mapping[str, st
     if log and len(seen) and seen.min() > 0.0 and seen.max() > 30.0 * seen.min():
         ax.set_yscale("log")
     ax.set_xlabel("step", fontsize=8)
-    ax.xaxis.get_major_locator().set_params(integer=True)
+    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     ax.tick_params(labelsize=7)
     ax.grid(alpha=0.3, lw=0.5)

@@ -12,13 +12,11 @@ from typing import Any
 import jax.numpy as jnp
 
 from tflane_jax.errors import UserError
+from tflane_jax.layers.positions import inverse_sigmoid
 from tflane_jax.models.host import HostConfig
 from tflane_jax.models.marker_fusion import as_fused
 from tflane_jax.models.prior import Prior
 from tflane_jax.scene import CenterlinePrediction, Example, Prediction
-
-# Scores stay off 0 and 1, whose logits are infinite.
-_LEAST = 1e-6
 
 
 @dataclass(frozen=True)
@@ -59,8 +57,7 @@ class MarkerLanes:
         observed, memory = self._prior.observe(example, memory)
         config: Any = self.model.priors.markers
         lanes = as_fused(observed, config)
-        trust = jnp.clip(lanes.weight * lanes.gate, _LEAST, 1.0 - _LEAST)
-        logits = jnp.where(lanes.valid, jnp.log(trust) - jnp.log1p(-trust), jnp.log(_LEAST))
+        logits = inverse_sigmoid(jnp.where(lanes.valid, lanes.weight * lanes.gate, 0.0), eps=1e-6)
         points = jnp.pad(jnp.where(lanes.valid[:, None, None], lanes.points, 0.0), ((0, 0), (0, 0), (0, 1)))
         return memory, Prediction(centerlines=CenterlinePrediction(points, logits[:, None]))
 

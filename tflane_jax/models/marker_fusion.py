@@ -184,11 +184,11 @@ class MarkerPrior(Prior):
 
     def into_bev(self, tokens: FusedMarkers, layer: int, cells: BevCells) -> Float[Array, "q c"]:
         """Return Eq. (3), after the lanes were written into their cells if `MarkerFusionConfig.bev` is set."""
-        features, written = cells.features, self.config.bev
-        if written is not None and (layer == 0 or written.layers == "all"):
+        features, raster_config = cells.features, self.config.bev
+        if raster_config is not None and (layer == 0 or raster_config.layers == "all"):
             lanes = replace(tokens.lanes, gate=tokens.gate)
-            raster = rasterise_markers(lanes, tokens.valid, cells.grid, written.between)
-            features = MarkerRasterFusion(written, name=f"marker_cells_{layer}")(features, raster)
+            raster = rasterise_markers(lanes, tokens.valid, cells.grid, raster_config.between)
+            features = MarkerRasterFusion(raster_config, name=f"marker_cells_{layer}")(features, raster)
         fusion = MarkerFusion(self.config, name=f"markers_{layer}")
         mask = fusion_mask(tokens.lanes, tokens.valid, cells.centers, self.config)
         return fusion(features, cells.position, tokens.tokens, mask, tokens.gate)

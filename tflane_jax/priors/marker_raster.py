@@ -15,7 +15,10 @@ from tflane_jax.priors.bev_cells import cells_of
 from tflane_jax.priors.marker_memory import MarkerGuidance
 
 CHANNELS = 8
-"""Per cell: log(1 + lanes), trust; trust-weighted means of cos, sin, offset (2), start, end."""
+"""Per cell: log(1 + points), trust; trust-weighted means of cos, sin, offset (2), start, end."""
+
+# Weight of a lane without trust in the means of a cell, so that they are those of its direction and not 0 / 0.
+_LEAST = 1e-6
 
 
 @struct.dataclass
@@ -23,10 +26,9 @@ class MarkerRaster:
     """Lanes of markers by BEV cell, row by row; row 0 and column 0 at the low ends.
 
     Attributes:
-        features: (Q, `CHANNELS`), 0 in cells without lanes: log(1 + points of lanes in the cell / points of a lane
-            within one of its K - 1 pieces); the largest trust of them; means over them, weighted by trust, of cos and
-            sin of the direction, offset (x, y) from the cell centre in cells, whether the lane starts here, and whether
-            it ends here.
+        features: (Q, `CHANNELS`), 0 in cells without lanes: log(1 + number of points / (`between` + 1)); the largest
+            trust of these points' lanes; means over the points, weighted by trust, of cos and sin of the direction,
+            offset (x, y) from the cell centre in cells, first point of its lane (0 or 1), last point (0 or 1).
         trust: (Q,) in [0, 1], c of Eq. (3) times the weight of Eq. (4) of the most trusted lane; 0 without lanes.
     """
 
@@ -43,33 +45,38 @@ def rasterise_markers(lanes: MarkerGuidance, valid: Bool[Array, " n"], grid: Bev
         grid: the cells.
         between: points interpolated between successive points of a lane, so that a lane leaves no gap.
     """
-    points = grid.range.normalise(jnp.where(valid[:, None, None], lanes.points, 0.0))
-    step = (jnp.arange(between + 1) / (between + 1))[None, None, :, None]
-    ahead = points[:, 1:] - points[:, :-1]
-    inner = points[:, :-1, None] + step * ahead[:, :, None]
-    inner = inner.reshape(len(points), (points.shape[1] - 1) * (between + 1), 2)
-    line = jnp.concatenate([inner, points[:, -1:]], 1)
-    metres = ahead * jnp.asarray(grid.range.size(2), ahead.dtype)[None, None]
-    length = jnp.sqrt((metres**2).sum(-1, keepdims=True))
-    # Of a doubled point, the direction is 0.
-    heading = metres / jnp.where(length > 0.0, length, 1.0)
-    heading = jnp.concatenate([jnp.repeat(heading, between + 1, axis=1), heading[:, -1:]], 1)
-
+    points = jnp.where(valid[:, None, None], lanes.points, 0.0)
+    line, direction = _with_points_between(points, between)  # metres
     count = line.shape[1]
     present = jnp.broadcast_to(valid[:, None], line.shape[:2])
-    cell, offset = cells_of(line, present, grid)
-    ends = jnp.broadcast_to(jnp.stack([jnp.arange(count) == 0, jnp.arange(count) == count - 1], -1), (*cell.shape, 2))
+    cell, offset = cells_of(grid.range.normalise(line), present, grid)
+    ends = jnp.stack([jnp.arange(count) == 0, jnp.arange(count) == count - 1], -1)
+    ends = jnp.broadcast_to(ends.astype(line.dtype), (*cell.shape, 2))
     trust = jnp.broadcast_to(jnp.where(valid, lanes.weight * lanes.gate, 0.0)[:, None], cell.shape)
-    values = jnp.concatenate([jnp.ones((*cell.shape, 1)), heading, offset, ends.astype(line.dtype)], -1)
-    # Lanes without any trust still have a direction: means need a weight above 0, and trust scales what is added.
-    weighted = values[..., 1:] * jnp.maximum(trust, 1e-6)[..., None]
+    weight = jnp.maximum(trust, _LEAST)[..., None]
+    weighted = weight * jnp.concatenate([direction, offset, ends], -1)
+    summed = jnp.concatenate([jnp.ones_like(weight), weight, weighted], -1)
+
     cells, flat = grid.rows * grid.columns, cell.reshape(-1)
-
-    def total(each: Float[Array, "n m v"]) -> Float[Array, "q v"]:
-        return jnp.zeros((cells, each.shape[-1])).at[flat].add(each.reshape(len(flat), each.shape[-1]), mode="drop")
-
-    number, weight = total(values[..., :1]), total(jnp.maximum(trust, 1e-6)[..., None])
-    means = total(weighted) / jnp.where(number > 0.0, weight, 1.0)
+    total = jnp.zeros((cells, summed.shape[-1])).at[flat].add(summed.reshape(len(flat), summed.shape[-1]), mode="drop")
+    number, weights, values = total[:, :1], total[:, 1:2], total[:, 2:]
     strongest = jnp.zeros(cells).at[flat].max(trust.reshape(-1), mode="drop")
+    means = values / jnp.where(number > 0.0, weights, 1.0)
     amount = jnp.log1p(number / (between + 1))
     return MarkerRaster(jnp.concatenate([amount, strongest[:, None], means], -1), strongest)
+
+
+def _with_points_between(
+    points: Float[Array, "n k 2"], between: int
+) -> tuple[Float[Array, "n m 2"], Float[Array, "n m 2"]]:
+    """Return lines with interpolated points, M = (K - 1) (between + 1) + 1, and the unit direction at each point.
+
+    The last point has the direction of the piece before it; a piece between equal points has none, (0, 0).
+    """
+    lines, pieces = len(points), points.shape[1] - 1
+    ahead = points[:, 1:] - points[:, :-1]
+    fraction = (jnp.arange(between + 1) / (between + 1))[None, None, :, None]
+    inner = (points[:, :-1, None] + fraction * ahead[:, :, None]).reshape(lines, pieces * (between + 1), 2)
+    length = jnp.sqrt((ahead**2).sum(-1, keepdims=True))
+    direction = jnp.repeat(ahead / jnp.where(length > 0.0, length, 1.0), between + 1, axis=1)
+    return jnp.concatenate([inner, points[:, -1:]], 1), jnp.concatenate([direction, direction[:, -1:]], 1)

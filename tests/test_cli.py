@@ -259,6 +259,7 @@ def test_several_seeds_are_evaluated_with_mean_and_deviation(config, tmp_path):
         (["eval", "RUN", "--root", "logs"], "add --data argoverse2"),
         (["predict", "RUN", "--out", "RUN/config.json"], "cannot write to"),
         (["predict", "RUN", "--count", "0", "--out", "x"], "nothing to predict"),
+        (["bench", "--out", "RUN/config.json"], "config.json is no folder"),
         (["data", "check", "nowhere"], "there is no nowhere: name a folder of Argoverse 2 logs"),
     ],
 )

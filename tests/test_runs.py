@@ -44,6 +44,11 @@ def aged(content):
     return old
 
 
+def test_folders_may_be_named_by_text(config, tmp_path):
+    train_run(config, f"{tmp_path}/run", progress=False)
+    assert open_run(f"{tmp_path}/run").step == open_run(tmp_path / "run").step
+
+
 def test_a_run_of_an_older_version_opens_and_resumes(config, tmp_path, capsys, monkeypatch):
     folder = tmp_path / "run"
     train_run(config, folder, progress=False)

@@ -62,11 +62,12 @@ class Run:
     params: tuple[Params, ...]
 
 
-def train_run(config: RunConfig, folder: Path, *, start: Start = "new", progress: bool = True) -> TrainingResult:
+def train_run(config: RunConfig, folder: Path | str, *, start: Start = "new", progress: bool = True) -> TrainingResult:
     """Train a configuration into a folder, with data, evaluation on the validation split, curves and pictures.
 
     Raises UserError like `training.loop.train` and the datasets, and `Interrupted` like that.
     """
+    folder = Path(folder)
     # All this before building data, which may take long.
     from_first(lambda: check_start(folder, start))
     with agreed():
@@ -179,7 +180,7 @@ def current_form(saved: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
     return current, notices + added_settings(migrated, current)
 
 
-def open_run(folder: Path, which: Which | None = None) -> Run:
+def open_run(folder: Path | str, which: Which | None = None) -> Run:
     """Return a run's averaged parameters and configuration from one of its checkpoints alone.
 
     Args:
@@ -189,6 +190,7 @@ def open_run(folder: Path, which: Which | None = None) -> Run:
     Raises:
         UserError: the checkpoint is missing, damaged, or of an unreadable version.
     """
+    folder = Path(folder)
     plain = Checkpoints(folder / "checkpoints")
     last = plain.find("last")
     config, notices = _read_config(plain.path(last) / "manifest.json", plain.manifest(last).config)

@@ -112,6 +112,14 @@ def test_a_run_without_checkpoints_is_an_error(tmp_path):
         Checkpoints(tmp_path / "nothing").find("last")
 
 
+@pytest.mark.parametrize(("config", "message"), [(False, "is no run folder"), (True, "ended before its first one")])
+def test_only_a_run_is_said_to_have_ended_before_its_first_checkpoint(tmp_path, config, message):
+    if config:
+        (tmp_path / "config.json").touch()
+    with pytest.raises(UserError, match=message):
+        Checkpoints(tmp_path / "checkpoints").find("last")
+
+
 def largest_file(folder):
     return max((p for p in (folder / "state").rglob("*") if p.is_file()), key=lambda p: p.stat().st_size)
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import tflane_jax
 from tflane_jax.errors import UserError
+from tflane_jax.files.atomic import check_writable
 
 
 def run(options: argparse.Namespace) -> int:
@@ -16,5 +17,6 @@ def run(options: argparse.Namespace) -> int:
     root = Path(tflane_jax.__file__).parent.parent
     if not (root / "benchmarks" / "__main__.py").is_file():
         raise UserError(f"no benchmarks beside the package ({root}): run tflane bench from a source checkout")
+    check_writable(options.out / "host.json")  # the first file, before minutes of measuring
     command = [sys.executable, "-m", "benchmarks", "--out", str(options.out.absolute())]
     return subprocess.run(command, cwd=root, check=False).returncode

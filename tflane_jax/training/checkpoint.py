@@ -134,6 +134,8 @@ class Checkpoints:
     def find(self, which: Which) -> int:
         """Return the step of a checkpoint; raises UserError, with a list of those that exist, if there is none."""
         steps = self.steps()
+        if not steps and not (run := self.folder.parent).joinpath("config.json").exists():
+            raise UserError(f"{run} is no run folder: it has no config.json, and {self.folder} holds no checkpoint")
         if not steps:
             raise UserError(f"{self.folder} holds no checkpoint: the run ended before its first one was written")
         step = steps[-1] if which == "last" else self.best_step() if which == "best" else which

@@ -11,12 +11,12 @@ import pytest
 from tests.models.cases import BASELINE
 from tflane_jax.ablations.compare import compare
 from tflane_jax.ablations.jobs import Job
-from tflane_jax.ablations.workers import Worker, _cores, worker_threads
+from tflane_jax.ablations.workers import Worker, worker_threads
 from tflane_jax.config import EvaluationConfig, RunConfig, WorldData
 from tflane_jax.errors import UserError
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.training.loop import TrainingConfig
-from tflane_jax.training.provenance import read_provenance, thread_setting
+from tflane_jax.training.provenance import read_provenance
 from tflane_jax.training.schedule import OptimConfig
 from tflane_jax.world.simulate import WorldConfig
 
@@ -31,7 +31,7 @@ CONFIG = RunConfig(
 
 def test_a_worker_that_is_killed_is_named_by_its_run(tmp_path):
     job = Job(CONFIG, tmp_path / "runs" / "seed_0")
-    with Worker(0, 1) as worker:
+    with Worker([]) as worker:
         worker.begin(job)
         worker._process.kill()
         worker._process.join()
@@ -48,7 +48,7 @@ def test_a_worker_that_is_killed_is_named_by_its_run(tmp_path):
 def test_workers_tell_their_stage_and_end_at_once(tmp_path, monkeypatch, stage):
     monkeypatch.setenv("TFLANE_CACHE", str(tmp_path / "cache"))
     job = Job(CONFIG, tmp_path / "runs" / "seed_0")
-    with Worker(0, 1) as worker:
+    with Worker([]) as worker:
         worker.begin(job)
         while worker.stage != f" ({stage})":
             assert worker.check() is None
@@ -58,25 +58,6 @@ def test_workers_tell_their_stage_and_end_at_once(tmp_path, monkeypatch, stage):
     assert stage in job.log.read_text()
     assert "Traceback" not in job.log.read_text()
     assert not (job.folder / "checkpoints").exists()
-
-
-@pytest.mark.parametrize(("available", "parallel", "each"), [(8, 2, 4), (3, 2, 1), (2, 5, 1), (4, 1, 4)])
-def test_all_workers_have_the_same_number_of_cores(monkeypatch, available, parallel, each):
-    monkeypatch.setattr("os.sched_getaffinity", lambda _: set(range(10, 10 + available)))
-    cores = [_cores(slot, parallel) for slot in range(parallel)]
-    assert {len(some) for some in cores} == {each}
-    assert worker_threads(parallel) == thread_setting(each)
-    used = [core for some in cores for core in some]
-    assert len(set(used)) == min(len(used), available)
-
-
-def test_each_training_can_be_given_a_number_of_cores(monkeypatch):
-    monkeypatch.setattr("os.sched_getaffinity", lambda _: set(range(10, 14)))
-    assert [_cores(slot, 2, 1) for slot in range(2)] == [[10], [11]]
-    assert worker_threads(1, 1) == worker_threads(4) == worker_threads(2, 1)
-    assert worker_threads(1, 4) == worker_threads(1)
-    with pytest.raises(UserError, match="--cores 5: a training can have 1 to 4 cores here"):
-        worker_threads(1, 5)
 
 
 @pytest.mark.slow

@@ -16,6 +16,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from tflane_jax import accelerators
+from tflane_jax.ablations.cores import cores_each, cores_of_workers
 from tflane_jax.ablations.jobs import Failure, Job
 from tflane_jax.ablations.reservations import Reservations
 from tflane_jax.ablations.scores import code_digest, is_measured, measure_all
@@ -53,20 +54,7 @@ def worker_threads(parallel: int, cores: int | None = None) -> dict[str, Any]:
     """Return the thread setting in which `train_all` trains; raise UserError for more cores than there are."""
     if parallel == 1 and cores is None:
         return thread_setting()
-    return thread_setting(len(_cores(0, parallel, cores)) or None, devices=1)
-
-
-def _cores(slot: int, parallel: int, cores: int | None = None) -> list[int]:
-    """Return the cores of a worker. All workers have the same number, so that results do not depend on the worker."""
-    if not hasattr(os, "sched_getaffinity"):
-        if cores is not None:
-            raise UserError(f"--cores {cores}: this system does not tell a process which cores to use")
-        return []
-    every = sorted(os.sched_getaffinity(0))
-    if cores is not None and not 1 <= cores <= len(every):
-        raise UserError(f"--cores {cores}: a training can have 1 to {len(every)} cores here")
-    each = cores or max(len(every) // parallel, 1)
-    return [every[(slot * each + i) % len(every)] for i in range(each)]
+    return thread_setting(cores_each(parallel, cores) or None, devices=1)
 
 
 @contextlib.contextmanager
@@ -115,7 +103,8 @@ def _train_in_workers(queue: Queue, jobs: Sequence[Job], parallel: int, cores: i
     failures: list[Failure] = []
     built: set[Any] = set()
     with contextlib.ExitStack() as stack:
-        workers = [stack.enter_context(Worker(slot, parallel, cores)) for slot in range(min(parallel, len(queue)))]
+        shares = stack.enter_context(cores_of_workers(min(parallel, len(queue)), cores_each(parallel, cores)))
+        workers = [stack.enter_context(Worker(share, slot, parallel)) for slot, share in enumerate(shares)]
         total, done = sum(job.config.training.steps for job in jobs), sum(job.step() for job in jobs)
         bar = stack.enter_context(
             progress_bar(total=total, initial=done, desc=f"train and measure {len(jobs)} runs", unit="step")
@@ -168,8 +157,9 @@ def _build(job: Job, built: set[Any]) -> None:
 class Worker:
     """A process on its own cores and GPU that trains one job after the other, and compiles every model once."""
 
-    def __init__(self, slot: int, parallel: int, cores: int | None = None) -> None:
-        self._cores, self._accelerator = _cores(slot, parallel, cores), accelerators.of_worker(slot, parallel)
+    def __init__(self, cores: list[int], slot: int = 0, parallel: int = 1) -> None:
+        """Prepare worker number `slot` of `parallel`; an empty list of cores leaves it all."""
+        self._cores, self._accelerator = cores, accelerators.of_worker(slot, parallel)
         self.job: Job | None = None
         self.tasks: set[Any] = set()
         self.stage = ""

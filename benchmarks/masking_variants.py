@@ -4,12 +4,14 @@
 
 The module (temporal and spatial encoder) of `configs/tf_lane/masking.py` on random tracks, for the number of lane
 queries of the small host and of the papers. A variant's time includes making its mask from the distances between
-lanes and tracks. Ratios are to the paper's masks (LT/LL), in one run.
+lanes and tracks. Ratios are to the paper's masks (LT/LL), in one run. Beside them stand the scores of the trained
+variants, where docs/results holds them (`tflane tables tf_lane.masking --record docs/results`).
 """
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +20,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.timing import compile_jax, interleave, machine, markdown_table, save, summarise
+from tflane_jax.ablations.paper.tf_lane import MASKING
 from tflane_jax.config import load_ablations, load_config
+from tflane_jax.files.fields import load_json
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.models.prior import HostQueries, HostSpec
 from tflane_jax.models.traffic_flow_module import SpatialEncoder, TemporalEncoder, TrafficFlowConfig
@@ -29,6 +33,8 @@ from tflane_jax.tasks.lane_graph import LaneGraphTask
 PAPER = "LT/LL"
 QUERIES, BATCH, DIM, POINTS = (48, 200), 4, 64, 11
 RANGE = PerceptionRange((-30.0, 30.0), (-15.0, 15.0))
+RECORDED = Path(__file__).parents[1] / f"docs/results/{MASKING.name}.json"
+SCORES = ("all/DET_l", MASKING.primary)
 
 
 def variants() -> dict[str, TrafficFlowConfig]:
@@ -84,6 +90,40 @@ def program(config: TrafficFlowConfig, queries: HostQueries, tracks: TrafficFlow
     return jax.grad(total), start
 
 
+def trained_scores(file: Path = RECORDED) -> dict[str, dict[str, str]]:
+    """Return `SCORES` of each trained variant at its last checkpoint, in percent; nothing where none is recorded.
+
+    Args:
+        file: summary of the table `tf_lane.masking`.
+    """
+    if not file.exists():
+        return {}
+    recorded = {row["model"]: row for row in load_json(file)["rows"] if row["checkpoint"] == "last"}
+    names = {MASKING.claims[0].control: PAPER}
+    names |= {
+        row.name: row.config.partition(":")[2] for row in MASKING.rows if row.config.startswith("tf_lane/masking:")
+    }
+    return {name: {s: recorded[row][s] for s in SCORES} for row, name in names.items() if row in recorded}
+
+
+def speed_and_scores(
+    timings: Mapping[str, Mapping[str, Mapping[str, float]]], scores: Mapping[str, Mapping[str, str]]
+) -> str:
+    """Return a row for each variant: its time for each number of queries, and its scores where it was trained.
+
+    Args:
+        timings: of `timing.summarise`, by number of queries and variant.
+        scores: of `trained_scores`.
+    """
+    columns = SCORES if scores else ()
+    rows = []
+    for name in next(iter(timings.values())):
+        of_variant = [by_name[name] for by_name in timings.values()]
+        times = [f"{c['median_ms']:.2f} ms" if name == PAPER else f"{c['ratio']:.2f}" for c in of_variant]
+        rows.append([name, *times, *(scores.get(name, {}).get(score, "-") for score in columns)])
+    return markdown_table(["masks", *(f"{count} queries" for count in timings), *columns], rows)
+
+
 def run(out: Path, *, queries: tuple[int, ...] = QUERIES, seconds: float = 8.0) -> dict[str, Any]:
     """Run the benchmark, print its table and write `masking_variants.json` and `.md` into `out`; return the record.
 
@@ -101,14 +141,8 @@ def run(out: Path, *, queries: tuple[int, ...] = QUERIES, seconds: float = 8.0) 
             compiled[name] = compile_jax(gradient, params, *inputs)
         timings = summarise(interleave({name: c.program for name, c in compiled.items()}, seconds), PAPER)
         record["queries"][str(count)] = timings
-    names = list(variants())
-    header = ["masks", *(f"{count} queries" for count in queries)]
-    cells = [[record["queries"][str(count)][name] for count in queries] for name in names]
-    shown = [
-        [name, *(f"{c['median_ms']:.2f} ms" if name == PAPER else f"{c['ratio']:.2f}" for c in row)]
-        for name, row in zip(names, cells, strict=True)
-    ]
-    text = markdown_table(header, shown)
+    record["scores"] = trained_scores()
+    text = speed_and_scores(record["queries"], record["scores"])
     print(text)
     save(out, "masking_variants", record, text)
     return record

@@ -19,6 +19,7 @@ from benchmarks import (
     marker_occlusion,
     marker_scene_pictures,
     marker_scenes,
+    masking_variants,
     metrics,
     paper_sizes,
 )
@@ -28,6 +29,7 @@ from tests.models.cases import CAMERA_TOPONET, make_camera_example
 from tests.models.test_marker_fusion import CONFIG as MARKERS
 from tests.parameters import random_params
 from tests.shared import ROOT
+from tflane_jax.ablations.paper.tf_lane import MASKING
 from tflane_jax.config import WorldData, apply_overrides, load_config
 from tflane_jax.config_io import to_text
 from tflane_jax.datasets.base import ExampleConfig
@@ -67,6 +69,30 @@ def test_every_program_runs_in_every_round():
     times = interleave({name: lambda name=name: program(name) for name in calls}, seconds=0.0, least_rounds=4)
     assert {len(values) for values in times.values()} == {4}
     assert min(calls.values()) >= 4
+
+
+def test_speed_and_accuracy_of_masks_stand_in_one_table(tmp_path):
+    variants = list(masking_variants.variants())
+    timings = {"48": {name: {"median_ms": 2.0, "ratio": 1.5} for name in variants}}
+    assert masking_variants.trained_scores(tmp_path / "none.json") == {}
+    plain = masking_variants.speed_and_scores(timings, {}).splitlines()
+    assert (plain[0].split(), len(plain)) == (["|", "masks", "|", "48", "queries", "|"], 2 + len(variants))
+    rows = [
+        {"model": row.name, "checkpoint": which, **dict.fromkeys(MASKING.columns, f"{i}{which}")}
+        for i, row in enumerate(MASKING.rows)
+        for which in ("last", "best")
+    ]
+    (tmp_path / "recorded.json").write_text(json.dumps({"rows": rows}))
+    scores = masking_variants.trained_scores(tmp_path / "recorded.json")
+    # The first row of the table has no traffic flow, and so no masks.
+    assert {name: values["all/DET_l"] for name, values in scores.items()} == {
+        name: f"{i}last" for i, name in enumerate(variants, 1)
+    }
+    table = masking_variants.speed_and_scores(timings, scores).splitlines()
+    assert [cell.strip() for cell in table[2].split("|")[1:-1]] == [variants[0], "2.00 ms", "1last", "1last"]
+    assert [cell.strip() for cell in table[3].split("|")[1:-1]] == [variants[1], "1.50", "2last", "2last"]
+    del scores[variants[1]]
+    assert masking_variants.speed_and_scores(timings, scores).splitlines()[3].count(" - ") == 2
 
 
 def test_compiled_program_sees_its_arguments():

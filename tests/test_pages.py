@@ -4,6 +4,7 @@ import re
 import shlex
 from collections.abc import Iterator
 from functools import cache
+from typing import Any
 
 import pytest
 
@@ -11,6 +12,7 @@ from tests.shared import ROOT
 from tflane_jax.cli import build_parser
 from tflane_jax.config import RunConfig, apply_overrides, load_config
 from tflane_jax.errors import UserError
+from tflane_jax.runs import check_origin
 
 PAGES = {
     path.relative_to(ROOT).as_posix(): path.read_text("utf-8")
@@ -37,7 +39,9 @@ def fault(words: list[str]) -> str | None:
             return f"unknown argument {rest[0]}"
         if rest and options.command not in ("compare", "sweep"):  # of these, the settings are for any configuration
             config = getattr(options, "config", None)
-            apply_overrides(RunConfig() if config is None else _config(config), rest)
+            made = apply_overrides(RunConfig() if config is None else _config(config), rest)
+            if options.command == "train":
+                check_frozen(made)
     except SystemExit as error:
         return "wrong arguments" if error.code else None
     except UserError as error:
@@ -46,6 +50,12 @@ def fault(words: list[str]) -> str | None:
 
 
 _config = cache(load_config)
+
+
+def check_frozen(config: RunConfig) -> None:
+    """Raise UserError for frozen modules without weights; the run to start from need not exist."""
+    if config.training.init_from is None:
+        check_origin(config)
 
 
 def anchors(text: str) -> set[str]:
@@ -66,6 +76,7 @@ def test_commands_in_pages_parse():
     ("command", "said"),
     [
         ("train --config tf_lane/argoverse2 --data.root LOGS", "unknown setting --data.root"),
+        ("train --config camera/toponet_r50 --data.root ROOT", "would stay random"),
         ("train --config markers/toponet_r50 --task.model.encoder.bev.remat True", "True"),
         ("data stats --data argoverse2 --root LOGS --data.example.history-hz 2", "data.world.keyframes"),
         ("eval RUN --evaluation.versions v1.0", "unknown argument --evaluation.versions"),
@@ -75,6 +86,18 @@ def test_commands_in_pages_parse():
 def test_wrong_commands_are_found(command, said):
     (words,) = commands(f"```\ntflane {command}    # a remark\n```\n")
     assert said in (fault(words) or "")
+
+
+def test_configurations_in_pages_can_be_trained():
+    found = 0
+    for text in PAGES.values():
+        for block in re.findall(r"^```python\n(.*?)^```", text, re.DOTALL | re.MULTILINE):
+            if re.search(r"import .*RunConfig", block) and "def get_config" in block:
+                names: dict[str, Any] = {}
+                exec(block, names)
+                check_frozen(names["get_config"]())
+                found += 1
+    assert found > 0
 
 
 def test_commands_behind_blocks_of_python_are_found():

@@ -62,7 +62,7 @@ def small(tiny, **changes):
         "columns": ("all/DET_l", "all/recall"),
         "quoted": Quoted("a dataset", ({"model": "base", "DET_l": 1.5},)),
         "steps": 4,
-        "note": "This data set has no traffic elements.",
+        "note": "This data set has no TOP_lt.",
     }
     return PaperTable(**{**settings, **changes})
 
@@ -79,8 +79,11 @@ def test_a_table_from_training_to_page(tiny, tmp_path, capsys):
     text = path.read_text()
     assert "tfm, traffic of another scene" in text
     assert "The paper's own numbers, not comparable with these: a dataset" in text
-    assert "\nThis data set has no traffic elements.\n" in text
-    assert r"\begin{tabular}" in (folder / "table.tex").read_text()
+    assert "\nThis data set has no TOP_lt.\n" in text
+    tex = (folder / "table.tex").read_text()
+    assert tex.count(r"\begin{tabular}") == 2
+    assert re.search(r"(?<!\\)[_%&#]", tex.replace(" & ", "")) is None
+    assert "\nThis data set has no TOP\\_lt.\n" in tex
     summary = json.loads((folder / "summary.json").read_text())
     assert summary["seeds"] == [0, 1]
     assert summary["cores of a run"]
@@ -107,7 +110,7 @@ def test_a_table_from_training_to_page(tiny, tmp_path, capsys):
     record([folder / "summary.json"], tmp_path / "results")
     written = (tmp_path / "results.md").read_text()
     assert "## paper.9: a small table" in written
-    assert "\nThis data set has no traffic elements.\n" in written
+    assert "\nThis data set has no TOP_lt.\n" in written
     assert "tflane tables paper.9 --seeds 2 --jobs 2" in written
     assert max(map(len, (line for line in written.splitlines() if not line.startswith("|")))) <= 120
     assert written == page(tmp_path / "results")

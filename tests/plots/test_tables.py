@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from tflane_jax.plots.tables import format_table, save_table
+from tflane_jax.plots.tables import format_table, latex_table, save_table
 
 ROWS = [
     {"model": "baseline", "DET_l": 0.25, "lanes": 7, "best": False},
@@ -42,6 +42,27 @@ def test_cells_without_a_number(value, shown):
 def test_without_rows_the_table_has_a_header_only_and_without_columns_nothing():
     assert format_table([], ["a"]) == "| a   |\n| --- |"
     assert format_table([], title="a title") == "a title"
+
+
+def test_latex_has_its_special_characters_escaped():
+    rows = [{"all/DET_l": "45.5 ± 0.8", "model": "a|b {50 %}"}, {"model": "~x^2 & \\#$"}]
+    assert latex_table(rows, caption="TOP_ll") == "\n".join(
+        [
+            r"\begin{table}",
+            r"\centering",
+            r"\caption{TOP\_ll}",
+            r"\begin{tabular}{ll}",
+            r"\toprule",
+            r"all/DET\_l & model \\",
+            r"\midrule",
+            r"45.5 $\pm$ 0.8 & a|b \{50 \%\} \\",
+            r"- & \textasciitilde{}x\textasciicircum{}2 \& \textbackslash{}\#\$ \\",
+            r"\bottomrule",
+            r"\end{tabular}",
+            r"\end{table}",
+            "",
+        ]
+    )
 
 
 def test_both_files_hold_the_rows(tmp_path):

@@ -47,7 +47,7 @@ from tflane_jax.ablations.workers import train_all
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import write_json, write_text
 from tflane_jax.files.fields import load_json
-from tflane_jax.plots.tables import format_table, latex_table, save_table
+from tflane_jax.plots.tables import format_table, latex_table, latex_text, save_table
 from tflane_jax.progress import progress_bar
 
 GEOMETRIC = ", geometric"
@@ -189,7 +189,7 @@ def _save_scores(table: PaperTable, results: Results, folder: Path, *, quick: bo
     text, tex = path.read_text(encoding="utf-8"), latex_table(rows, caption=title)
     if table.note:
         text += f"\n{table.note}\n"
-        tex += f"\n{table.note}\n"
+        tex += f"\n{latex_text(table.note)}\n"
     if table.quoted.rows:
         paper = f"The paper's own numbers, not comparable with these: {table.quoted.source}"
         text += "\n" + format_table(table.quoted.rows, title=paper) + "\n"

@@ -49,12 +49,12 @@ def latex_table(
     names = list(columns) if columns is not None else list(dict.fromkeys(name for row in rows for name in row))
     numeric = [all(row.get(name) is None or _is_number(row.get(name)) for row in rows) for name in names]
     lines = [[_cell(row.get(name), digits).replace("\\|", "|") for name in names] for row in rows]
-    body = [" & ".join(map(_latex, line)) + r" \\" for line in (names, *lines)]
+    body = [" & ".join(map(latex_text, line)) + r" \\" for line in (names, *lines)]
     return "\n".join(
         [
             r"\begin{table}",
             r"\centering",
-            *([rf"\caption{{{_latex(caption)}}}"] if caption else []),
+            *([rf"\caption{{{latex_text(caption)}}}"] if caption else []),
             rf"\begin{{tabular}}{{{''.join('r' if right else 'l' for right in numeric)}}}",
             r"\toprule",
             body[0],
@@ -66,6 +66,11 @@ def latex_table(
             "",
         ]
     )
+
+
+def latex_text(text: str) -> str:
+    """Return the text with LaTeX's special characters escaped."""
+    return "".join(_LATEX.get(character, character) for character in text)
 
 
 def save_table(
@@ -121,11 +126,6 @@ _LATEX = {
     "~": r"\textasciitilde{}",
     "^": r"\textasciicircum{}",
 } | {character: f"\\{character}" for character in "&%$#_{}"}
-
-
-def _latex(text: str) -> str:
-    """Return the text with LaTeX's special characters escaped."""
-    return "".join(_LATEX.get(character, character) for character in text)
 
 
 def _plain(value: Any) -> Any:

@@ -105,9 +105,13 @@ class PhotoReader:
             photos: of one size.
             focal: focal length, pixels, where it is known.
         """
-        found = [self._search(photo, grey, focal) for photo in photos if not is_blank(grey := _grey(photo))]
-        best = max(found, key=lambda seen: seen.judged.rank, default=None)
-        return None if best is None or best.judged.rank < _LEAST else best.view
+        found = []
+        for photo in photos:
+            if not is_blank(grey := _grey(photo)):
+                seen = self._search(photo, grey, focal)
+                found.append((_worth(seen, photo), seen.view))
+        worth, view = max(found, key=lambda one: one[0], default=(0.0, None))
+        return None if worth < _LEAST else view
 
     def read_view(self, photo: UInt8[np.ndarray, "h w 3"], view: Placement) -> PhotoLanes:
         """Return the lanes in a view that `find_view` found in other frames of the camera."""
@@ -167,8 +171,8 @@ class PhotoReader:
         Without a known `horizon` (row) the view was searched, and may show nothing that is plausible.
         """
         judged, (height, width) = seen.judged, photo.shape[:2]
-        searched = horizon is None and seen.view != fit_photo(photo).placement
-        worth_of_view = judged.rank if searched else judged.value
+        searched = horizon is None and not _is_whole(seen.view, photo)
+        worth_of_view = judged.value if horizon is not None else _worth(seen, photo)
         if horizon is None and worth_of_view < _LEAST:
             return PhotoLanes(seen.view, (), (), (), judged.value, _NOTHING)
         # Lanes meet above their view's horizon where the road rises. Those of a known camera may be nearly parallel and
@@ -206,6 +210,15 @@ class PhotoReader:
             judged.value,
             "; ".join(warnings),
         )
+
+
+def _worth(seen: _ViewLanes, photo: UInt8[np.ndarray, "h w 3"]) -> float:
+    """Return the plausibility of a view: of a searched one, only lanes on paint count."""
+    return seen.judged.value if _is_whole(seen.view, photo) else seen.judged.rank
+
+
+def _is_whole(view: Placement, photo: UInt8[np.ndarray, "h w 3"]) -> bool:
+    return view == fit_photo(photo).placement
 
 
 def _grey(photo: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w"]:

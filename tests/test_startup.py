@@ -141,6 +141,23 @@ def test_a_signal_before_the_first_step_ends_the_command(tmp_path, capsys, monke
     assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_whose_error_python_ignores_ends_the_command_all_the_same(capsys, monkeypatch, number):
+    class Callback:  # like that of JAX, which the garbage collector calls
+        def __del__(self):
+            signal.raise_signal(number)
+
+    def command(options):
+        del options
+        Callback()
+        for _ in range(1000):
+            time.sleep(0.01)
+
+    monkeypatch.setattr("tflane_jax.commands.cache.show", command)
+    assert main(["cache", "list"]) == 128 + number
+    assert capsys.readouterr().err == "tflane: stopped\n"
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize("where", ["tracing", "compiling"])

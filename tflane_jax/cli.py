@@ -25,6 +25,8 @@ from tflane_jax.errors import Interrupted, UserError
 from tflane_jax.memory import keep_freed_memory
 from tflane_jax.startup import leave
 
+_AGAIN_SECONDS = 0.1
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command and return its exit code: 0 done, 2 an error of the user's, 128 + n ended by signal n."""
@@ -35,7 +37,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options, rest = parser.parse_known_args(arguments)
     if rest and not options.takes_overrides:
         parser.error(f"unknown argument {rest[0]}: see tflane {options.command} --help")
-    with _ending_on_sigterm():
+    with _ending_on_sigterm(), _signals_not_lost():
         code = _run_command(options, rest)
     if arguments is None:  # the program itself
         leave(code)
@@ -92,6 +94,25 @@ def _ending_on_sigterm() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
+
+@contextlib.contextmanager
+def _signals_not_lost() -> Iterator[None]:
+    """Send a signal again if Python ignored what it raised, as in callbacks of the garbage collector (JAX has one)."""
+    before = sys.unraisablehook
+
+    def hook(ignored: Any) -> None:
+        if isinstance(error := ignored.exc_value, KeyboardInterrupt):
+            number = getattr(error, "number", signal.SIGINT)
+            threading.Timer(_AGAIN_SECONDS, os.kill, (os.getpid(), number)).start()
+        else:
+            before(ignored)
+
+    sys.unraisablehook = hook
+    try:
+        yield
+    finally:
+        sys.unraisablehook = before
 
 
 def build_parser() -> argparse.ArgumentParser:

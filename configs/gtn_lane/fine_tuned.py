@@ -1,11 +1,10 @@
 """LSTR's published network, warm-started and fine-tuned on front views of the built-in world, with every encoder.
 
-    for E in transformer gcn han; do
-        tflane convert --config gtn_lane/fine_tuned:$E --weights lstr --out runs/from_lstr/$E
-    done
-    tflane convert --config gtn_lane/fine_tuned:gtn --weights lstr --edge-weight 0.98 --out runs/from_lstr/gtn
     tflane tables gtn_lane.2 --search
     tflane tables gtn_lane.2
+
+Both first convert LSTR's published weights to runs/from_lstr/ENCODER (`--weights lstr`, docs/gtn_lane.md), for the GTN
+with an edge weight of 0.98.
 
 Networks are those of `lstr.py` and `gtn_tusimple.py` at full size: LSTR's parameters have no other form. The
 transformer starts as LSTR, the GTN as almost LSTR, GCN and HAN with what has a place in them (docs/gtn_lane.md). An

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 from tflane_jax.config import load_config
 from tflane_jax.convert.backbone import PART as BACKBONE
@@ -19,31 +21,54 @@ from tflane_jax.runs import save_weights
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.training.runtime import configure_jax
 
+_TABLE = "conversion"
+
 
 def run(options: argparse.Namespace) -> int:
     """Write the run, and a table with the conversion of every tensor."""
-    if (options.out / "config.json").exists():
-        raise UserError(f"{options.out} already holds a run: choose another folder with --out, or delete that one")
     configure_jax()
-    config = load_config(options.config)
-    weights = options.weights or config.weights
-    if weights is None:
-        raise UserError(f"{options.config} names no weights: add --weights FILE")
-    part = None
-    if isinstance(config.task, LaneGraphTask) and is_backbone(read_state_dict(weights)):
-        if options.edge_weight is not None:
-            raise UserError(f"--edge-weight is of GTN encoders: {weights} is a backbone, leave it out")
-        part = BACKBONE
-        params, table = load_backbone(weights, config.task.model)
-        save_weights(config, params, options.out, part=part)
-    else:
-        params, table = load_weights(weights, config.task, "fresh", options.edge_weight)
-        save_weights(replace(config, weights=weights), params, options.out)
-    title = f"{weights}: every tensor and what becomes of it"
+    table, title, part = convert(options.config, options.out, options.weights, options.edge_weight)
     print(format_table(table, title=title))
-    written = save_table(options.out / "conversion", table, {"weights": str(weights)}, title=title)
     count = sum(row["tensor"] != "-" for row in table)
-    print(f"\n{count} tensors; run written to {options.out}, table to {written[0]}")
+    print(f"\n{count} tensors; run written to {options.out}, table to {options.out / _TABLE}.md")
     if part is not None:
         print(f"it holds {part} alone; train from it: --training.init-from {options.out} --training.init-partly")
     return 0
+
+
+def convert(
+    reference: str, out: Path, weights: Path | None = None, edge_weight: float | None = None
+) -> tuple[list[dict[str, Any]], str, str | None]:
+    """Write published weights as a run, with a table of what becomes of every tensor.
+
+    Args:
+        reference: of a configuration.
+        out: folder of the run.
+        weights: file, or name of published weights; None for those that the configuration names.
+        edge_weight: weight of the selected edge types of a GTN encoder; None for the whole.
+
+    Returns:
+        The table's rows, its title, and which part of the model the run holds (None for all of it).
+
+    Raises:
+        UserError: the folder holds a run, there are no weights, or they do not fit the model.
+    """
+    if (out / "config.json").exists():
+        raise UserError(f"{out} already holds a run: choose another folder with --out, or delete that one")
+    config = load_config(reference)
+    weights = weights or config.weights
+    if weights is None:
+        raise UserError(f"{reference} names no weights: add --weights FILE")
+    part = None
+    if isinstance(config.task, LaneGraphTask) and is_backbone(read_state_dict(weights)):
+        if edge_weight is not None:
+            raise UserError(f"--edge-weight is of GTN encoders: {weights} is a backbone, leave it out")
+        part = BACKBONE
+        params, table = load_backbone(weights, config.task.model)
+        save_weights(config, params, out, part=part)
+    else:
+        params, table = load_weights(weights, config.task, "fresh", edge_weight)
+        save_weights(replace(config, weights=weights), params, out)
+    title = f"{weights}: every tensor and what becomes of it"
+    save_table(out / _TABLE, table, {"weights": str(weights)}, title=title)
+    return table, title, part

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 from tflane_jax.ablations.paper.cost import core_minutes
-from tflane_jax.ablations.paper.table import PaperTable
+from tflane_jax.ablations.paper.table import Conversion, PaperTable
 from tflane_jax.ablations.published import record
 from tflane_jax.ablations.tables import TABLES, find_table
+from tflane_jax.commands.convert import convert
 from tflane_jax.errors import UserError
 from tflane_jax.plots.tables import format_table
 from tflane_jax.training.runtime import configure_jax
@@ -41,6 +44,8 @@ def run(options: argparse.Namespace) -> int:
         print(f"\n{_totals()}")
         return 0
     configure_jax()
+    for table in chosen:
+        _convert(table.conversions)
     if options.search:
         from tflane_jax.ablations.rate_search import search_rates
 
@@ -62,6 +67,14 @@ def run(options: argparse.Namespace) -> int:
     if options.record is not None:
         print("written:", record([path.with_name("summary.json") for path in written], options.record))
     return 0
+
+
+def _convert(conversions: Sequence[Conversion]) -> None:
+    """Make the runs of published weights that are not there yet."""
+    for wanted in conversions:
+        if not (Path(wanted.out) / "config.json").exists():
+            convert(wanted.config, Path(wanted.out), Path(wanted.weights), wanted.edge_weight)
+            print(f"converted {wanted.weights} to {wanted.out}, from which rows start", flush=True)
 
 
 def _check_together(options: argparse.Namespace) -> None:

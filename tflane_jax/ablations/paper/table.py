@@ -58,6 +58,23 @@ class RateSearch:
 
 
 @dataclass(frozen=True)
+class Conversion:
+    """Published weights that rows start from, as a run; `tflane tables` makes it, as `tflane convert` does.
+
+    Attributes:
+        config: reference of the run's configuration.
+        weights: their name, such as "lstr".
+        out: folder of the run.
+        edge_weight: of GTN encoders, see `convert.lstr_graphs`; None for others.
+    """
+
+    config: str
+    weights: str
+    out: str
+    edge_weight: float | None = None
+
+
+@dataclass(frozen=True)
 class PaperTable:
     """A table of a paper.
 
@@ -75,6 +92,7 @@ class PaperTable:
         seeds: number of seeds.
         steps: updates of every run; None for those of the configurations.
         hosts: models that rows start from. They are trained first and are no rows.
+        conversions: of published weights that rows start from.
         minutes: of a run's updates on one core, for estimates; the mean over rows in docs/results where it is recorded.
         host_minutes: the same for one of `hosts`.
         note: a sentence of the table's text, such as why a column of the paper is missing.
@@ -95,6 +113,7 @@ class PaperTable:
     seeds: int = 8
     steps: int | None = None
     hosts: tuple[TableRow, ...] = ()
+    conversions: tuple[Conversion, ...] = ()
     minutes: float = 6.0
     host_minutes: float = 6.0
     note: str = ""

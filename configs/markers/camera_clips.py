@@ -20,7 +20,8 @@ from tflane_jax.tasks.lane_graph import LaneGraphTask
 
 HERE = Path(__file__)
 HOSTS = "runs/markers/camera_hosts"
-STEPS = 200
+# With seed 0, markers are 1.1 points of DET_l above no prior at update 200, on validation data, and 3.0 at the end.
+STEPS = 600
 # Longer than the hosts', so that memory has something to bridge.
 CLIP = 4
 ROWS = ("toponet", "toponet_smerf", "uniform", "hard", "no_memory", "no_decay", "mlp", "transformer")
@@ -63,7 +64,7 @@ def _tuned(row: RunConfig, host: str = "camera_host") -> RunConfig:
         config,
         task=replace(config.task, model=model, clip=CLIP),
         # As in `toponet_markers.py`; with so few updates a shorter warm-up, and an average over the last 50.
-        optim=replace(config.optim, lr=0.5 * config.optim.lr, warmup_steps=20, ema_decay=0.98),
+        optim=replace(config.optim, lr=0.5 * config.optim.lr, warmup_steps=50, ema_decay=0.98),
         training=replace(
             config.training,
             steps=STEPS,

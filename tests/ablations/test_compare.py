@@ -9,6 +9,7 @@ import time
 import pytest
 
 from tests.models.cases import BASELINE
+from tflane_jax.ablations import workers
 from tflane_jax.ablations.compare import compare
 from tflane_jax.ablations.jobs import Job
 from tflane_jax.ablations.workers import Worker, worker_threads
@@ -41,6 +42,30 @@ def test_a_worker_that_is_killed_is_named_by_its_run(tmp_path):
     assert re.search(r"seed_0 failed: its messages are in .*seed_0\.log", str(failure))
     assert "killed by SIGKILL" in str(failure)
     assert "killed by SIGKILL" in job.log.read_text()
+
+
+def test_all_workers_are_told_to_end_before_one_is_waited_for(tmp_path, monkeypatch):
+    ended = []
+
+    class Fake(Worker):
+        def _begin_process(self):
+            pass
+
+        def end(self):
+            ended.append("told")
+
+        def __exit__(self, *_):
+            ended.append("waited for")
+
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(workers, "Worker", Fake)
+    monkeypatch.setattr(workers, "_build", interrupted)
+    jobs = [Job(CONFIG, tmp_path / name) for name in ("one", "other")]
+    with pytest.raises(KeyboardInterrupt):
+        workers.train_all(jobs, parallel=2)
+    assert ended == ["told", "told", "waited for", "waited for"]
 
 
 @pytest.mark.slow

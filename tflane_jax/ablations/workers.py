@@ -105,6 +105,7 @@ def _train_in_workers(queue: Queue, jobs: Sequence[Job], parallel: int, cores: i
     with contextlib.ExitStack() as stack:
         shares = stack.enter_context(cores_of_workers(min(parallel, len(queue)), cores_each(parallel, cores)))
         workers = [stack.enter_context(Worker(share, slot, parallel)) for slot, share in enumerate(shares)]
+        stack.callback(lambda: [worker.end() for worker in workers])  # before any of them is waited for
         total, done = sum(job.config.training.steps for job in jobs), sum(job.step() for job in jobs)
         bar = stack.enter_context(
             progress_bar(total=total, initial=done, desc=f"train and measure {len(jobs)} runs", unit="step")
@@ -178,13 +179,18 @@ class Worker:
         far.close()  # so that reading fails, instead of waiting, once the process is gone
         self.tasks.clear()
 
-    def __exit__(self, *_: object) -> None:
+    def end(self) -> None:
+        """Tell the process to end, without waiting for it."""
         if self.job is None and self._process.exitcode is None:
             with contextlib.suppress(OSError):
                 self._pipe.send(None)
         else:  # an error ends the comparison: the same command resumes what was written
             self._process.terminate()
         self._pipe.close()  # so that a process that has stopped waits for no further job
+
+    def __exit__(self, *_: object) -> None:
+        if not self._pipe.closed:
+            self.end()
         self._process.join()
 
     def begin(self, job: Job) -> None:

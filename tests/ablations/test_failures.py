@@ -131,6 +131,18 @@ def test_paired_tests_name_the_seeds_of_each_checkpoint(tmp_path, capsys):
     assert tested == {("last", "-"), ("best", "0, 2")}
 
 
+def test_the_scores_name_their_seeds(tmp_path, capsys):
+    """Regression: scores.json had lists alone, so nobody could tell which run a number of an incomplete row is from."""
+    results = Results(("base", "tfm"), (3, 1, 7), {}, "a protocol")
+    for model, seed in (("base", 7), ("base", 1), ("tfm", 3)):
+        results.add("", "last", model, seed, Measured(4, "a protocol", {"": {"all/recall": seed / 10}}, {"": {}}))
+    save_report(results, RunConfig().task, {}, tmp_path)
+    assert json.loads((tmp_path / "scores.json").read_text()) == {
+        "base": [{"seed": 1, "all/recall": 0.1}, {"seed": 7, "all/recall": 0.7}],
+        "tfm": [{"seed": 3, "all/recall": 0.3}],
+    }
+
+
 def test_a_row_that_lacks_seeds_takes_none_from_another_row(tmp_path, capsys):
     """Regression: paired tests took the seeds that all rows have, so one failed row left the others without any."""
     results = Results(("base", "tfm", "poor", "none"), (0, 1, 2), {}, "a protocol")

@@ -112,6 +112,7 @@ def test_a_table_from_training_to_page(tiny, tmp_path, capsys):
     assert "## paper.9: a small table" in written
     assert "\nThis data set has no TOP_lt.\n" in written
     assert "tflane tables paper.9 --seeds 2 --jobs 2" in written
+    assert "2 seeds, 4 updates a run, each on" in written
     assert max(map(len, (line for line in written.splitlines() if not line.startswith("|")))) <= 120
     assert written == page(tmp_path / "results")
 
@@ -142,6 +143,22 @@ def test_the_page_leaves_out_best_checkpoints_that_repeat_the_last(tmp_path):
     written = page(tmp_path)
     assert "**Interim**: 2 of 5 declared seeds." in written
     assert "\ntflane tables tf_lane.5 --seeds 2 --jobs 2\n" in written
+
+
+def test_the_page_tells_which_rows_made_how_many_updates(tmp_path):
+    """Regression: "2000, 4000 updates a run"."""
+    summary = dict.fromkeys(("table", "title", "protocol", "declared"), "x") | {"seeds": [0], "rows": []}
+    summary |= {"cores of a run": [1], "commits": [], "devices": [], "core minutes of a run": {"a": 1.0}}
+    summary |= {"findings": [], "quoted": {"rows": []}}
+    hosts = {"a": 20, "A host": 40, "b": 20, "B host": 40, "c": 20, "long": 80}
+    told = {
+        "1 seed, 20 updates a run, each on 1 core": {"a": 20, "b": 20},
+        "1 seed, 20 updates a run (40 of A host and B host; 80 of long), each on 1 core": hosts,
+        "1 seed, 20 or 40 updates a run, each on 1 core": [20, 40],  # an earlier summary
+    }
+    for sentence, steps in told.items():
+        (tmp_path / "x.json").write_text(json.dumps(summary | {"steps": steps}))
+        assert sentence in page(tmp_path).replace("\n", " ")
 
 
 def test_all_tables_are_checked_before_the_first_is_trained(tiny, tmp_path, monkeypatch, capsys):

@@ -30,6 +30,8 @@ from tflane_jax.datasets.front_views import FrontViewConfig
 from tflane_jax.datasets.nuscenes import NuScenesConfig
 from tflane_jax.datasets.openlane_v2 import OpenLaneV2Config
 from tflane_jax.datasets.procedural import ProceduralConfig
+from tflane_jax.datasets.real_maps import RealMapData
+from tflane_jax.datasets.recorded_logs import RecordedConfig, RecordedData
 from tflane_jax.datasets.streaming import StreamingConfig
 from tflane_jax.datasets.tusimple import TuSimpleConfig
 from tflane_jax.datasets.view_images import TOPONET_SUBSET_B
@@ -176,6 +178,24 @@ def test_a_split_that_logs_do_not_have_is_refused(logs):
     shutil.rmtree(logs / "sensor" / "train")
     with pytest.raises(UserError, match=r"has no split test, only val: add --split val$"):
         chosen("--data", "argoverse2", "--root", logs)
+
+
+def test_recorded_logs_have_the_splits_that_the_runs_own_data_name(tmp_path):
+    """Regression: --split val took all logs, training logs among them."""
+    recorded = ["--data", "recorded", "--root", tmp_path]
+    maps = RunConfig(data=RealMapData(val_logs=("a",), test_logs=("b", "c")))
+    for split, logs, without in (("val", ("a",), ()), ("test", ("b", "c"), ()), ("train", (), ("a", "b", "c"))):
+        found = chosen(*recorded, "--split", split, config=maps)
+        assert (found.root, found.logs, found.without) == (tmp_path, logs, without)
+    own = RunConfig(data=RecordedData(val=("a",), test=("b",)))
+    assert [chosen(*recorded, "--split", split, config=own).logs for split in SPLITS] == [(), ("a",), ("b",)]
+    # The default of eval, test, takes all of them; so does a folder with the name of the split.
+    assert chosen(*recorded) == RecordedConfig(tmp_path, example=WorldData().example)
+    assert chosen("--data", "recorded", "--root", tmp_path / "val", "--split", "val").logs == ()
+    unnamed = RunConfig(data=RealMapData(val_logs=("a",)))
+    for config, split in ((None, "val"), (RunConfig(data=RealMapData()), "train"), (unnamed, "test")):
+        with pytest.raises(UserError, match=f"nothing tells which .* split {split}: leave --split out to take all"):
+            chosen(*recorded, "--split", split, config=config)
 
 
 @pytest.mark.parametrize(

@@ -15,6 +15,7 @@ from tflane_jax.layers.masks import (
     nearest_mask,
     pair_mask,
     radius_mask,
+    squared_line_distance,
     track_distance,
 )
 
@@ -89,6 +90,33 @@ def test_a_line_without_length_is_a_point():
     mask = radius_mask(jnp.array([[3.0, 0.0], [3.1, 0.0]]), jnp.zeros((1, 2, 2)), jnp.ones(1, bool), 3.05)
     np.testing.assert_array_equal(mask, [[True], [False]])
     assert radius_mask(jnp.zeros((2, 2)), jnp.zeros((0, 2, 2)), jnp.ones(0, bool), 1.0).shape == (2, 0)
+
+
+@pytest.mark.parametrize("points", [0, 1, 2])
+@pytest.mark.parametrize("count", [0, 1, 3])
+def test_lines_of_no_and_of_one_point(points, count):
+    """Regression: radius_mask and squared_line_distance ended with a TypeError for lines of one point."""
+    rng = np.random.default_rng(10 * points + count)
+    places, lines = rng.uniform(-5, 5, (4, 2)), rng.uniform(-5, 5, (count, points, 2))
+    apart = np.full((4, count), np.inf)
+    if points:  # a straight line of one or two points, the same point by point
+        dense = lines[:, :1] + np.linspace(0, 1, 2001)[:, None] * (lines[:, -1:] - lines[:, :1])
+        apart = np.sqrt(((dense[None] - places[:, None, None]) ** 2).sum(-1)).min(-1)
+    mask = radius_mask(jnp.asarray(places), jnp.asarray(lines), jnp.ones(count, bool), 4.0)
+    np.testing.assert_array_equal(mask, apart <= 4.0)
+    np.testing.assert_allclose(
+        squared_line_distance(jnp.asarray(places), jnp.asarray(lines)), apart.T**2, rtol=1e-2, atol=1e-3
+    )
+    assert radius_mask(jnp.zeros((0, 2)), jnp.asarray(lines), jnp.ones(count, bool), 4.0).shape == (0, count)
+
+
+@pytest.mark.parametrize(("lanes", "tracks", "positions"), [(2, 3, 0), (2, 0, 4), (0, 3, 4), (2, 0, 0)])
+def test_distances_without_lanes_tracks_or_positions(lanes, tracks, positions):
+    """Regression: tracks without positions had no minimum."""
+    found = track_distance(
+        jnp.zeros((lanes, 5, 2)), jnp.zeros((tracks, positions, 2)), jnp.ones((tracks, positions), bool)
+    )
+    np.testing.assert_array_equal(found, np.full((lanes, tracks), np.inf))
 
 
 @pytest.mark.parametrize("points", [1, 2, 5])

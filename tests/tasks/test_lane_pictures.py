@@ -18,6 +18,7 @@ from tflane_jax.evaluation.results import EvaluationConfig
 from tflane_jax.models.host import HostConfig
 from tflane_jax.models.toponet import TopoNetConfig
 from tflane_jax.scene import CenterlinePrediction, Prediction, SegmentPrediction
+from tflane_jax.startup import showing
 from tflane_jax.tasks import Model
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.tasks.lane_pictures import titles
@@ -247,3 +248,18 @@ def test_titles_have_room_for_the_ids_of_logs(scene, title):
             return FrameInfo("fake", scene, 2_500_000_000, np.eye(4))
 
     assert titles(OneFrame(FakeConfig()), [0]) == [title]
+
+
+def test_stages_tell_the_prediction_for_pictures_from_that_for_scores(drawn, monkeypatch, tmp_path):
+    """Regression: a training showed "compiling the prediction" twice."""
+    monkeypatch.setattr("tflane_jax.evaluation.predict._compiled", set())
+    both, told = {"one": model(1, 5), "two": model(-1, 9)}, []
+    task, params = both["one"].task, both["one"].params
+    with showing(told.append):
+        task.evaluate(params, task.load(ProceduralConfig()), EvaluationConfig(batch_size=5))
+        task.drawing(WorldData(), EvaluationConfig(pictures=2))(tmp_path, 1, params)
+        drawn(both)
+    compiling = [name for name in told if name.startswith("compiling")]
+    assert compiling[:2] == ["compiling the prediction for scores", "compiling the prediction for pictures"]
+    assert set(compiling[2:]) == {"compiling the prediction for pictures"}
+    assert len(list((tmp_path / "pictures").glob("*.png"))) == 1

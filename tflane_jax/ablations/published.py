@@ -70,12 +70,22 @@ def _between(numbers: Collection[float]) -> str:
     return str(least) if least == most else f"{least} to {most}"
 
 
+def _updates(steps: Mapping[str, int] | Sequence[int]) -> str:
+    """Return how many updates a run of each row made, from those by row; earlier summaries name no rows."""
+    if not isinstance(steps, Mapping):
+        return f"{' or '.join(map(str, steps))} updates a run"
+    rows = {count: [name for name in steps if steps[name] == count] for count in sorted({*steps.values()})}
+    usual = max(rows, key=lambda count: len(rows[count]))
+    others = [f"{count} of {' and '.join(names)}" for count, names in rows.items() if count != usual]
+    return f"{usual} updates a run" + (f" ({'; '.join(others)})" if others else "")
+
+
 def _section(summary: Mapping[str, Any]) -> list[str]:
     minutes = summary["core minutes of a run"]
     cores = _listed(summary["cores of a run"])
     rows = _without_repeated(summary["rows"])
     facts = (
-        f"{_counted(len(summary['seeds']), 'seed')}, {_listed(summary['steps'])} updates a run, each on {cores} "
+        f"{_counted(len(summary['seeds']), 'seed')}, {_updates(summary['steps'])}, each on {cores} "
         f"core{'' if cores == '1' else 's'} ({_listed(summary['devices'])}); the updates of a run took "
         f"{_between(minutes.values())} minutes, other work beside it; code {_listed(summary['commits'])}. "
         f"{summary['protocol']}, test split of the built-in world, percent (mean ± std over seeds). "

@@ -19,7 +19,8 @@ def save_report(results: Results, task: Task, remarks: Mapping[str, Mapping[str,
     """Print the tables of every test set and save them; return the files, the table of the own test split first.
 
     `table.md` and `paired.md` are those of the own test split, `table-<name>.md` and so on those of other test sets.
-    `scores.json` holds the scores at the last step by row, in the order of the seeds.
+    `scores.json` holds the scores at the last step by row: a list with an object for each seed, which names it
+    (`seed`), in the order of the seeds.
     """
     written: list[Path] = []
     for test, suffix in suffixes(results).items():
@@ -33,7 +34,10 @@ def save_report(results: Results, task: Task, remarks: Mapping[str, Mapping[str,
         written.append(_save_table(results, test, metrics, task, remarks, out / f"table{suffix}"))
         if len(results.seeds) > 1:
             written += _save_paired(results, test, metrics, task, out / f"paired{suffix}")
-        last = {row: list(by_seed.values()) for row, by_seed in results.rows(test, "last").items()}
+        last = {
+            row: [{"seed": seed, **scores} for seed, scores in by_seed.items()]
+            for row, by_seed in results.rows(test, "last").items()
+        }
         write_json(out / f"scores{suffix}.json", last)
         written.append(out / f"scores{suffix}.json")
     return written

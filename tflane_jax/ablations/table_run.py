@@ -239,7 +239,7 @@ def _save_summary(
             "declared": declared.sentence(),
             "note": table.note,
             "seeds": list(results.seeds),
-            "steps": sorted({job.config.training.steps for job in runs}),
+            "steps": {name: jobs[0].config.training.steps for name, jobs in trained.items() if jobs},
             "cores of a run": sorted({job.threads["cores"] for job in runs}),
             "commits": sorted(commits) + sorted({text for job in runs for text in _measured_elsewhere(job)}),
             "devices": sorted({device for job in runs for device in facts(job).devices}),

@@ -18,7 +18,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
-from tflane_jax.datasets.base import Split
+from tflane_jax.datasets.base import SPLITS, Split
 from tflane_jax.datasets.plausible import FARTHEST, MOST_PIXELS
 from tflane_jax.errors import UserError
 from tflane_jax.files.fields import items, load_json, load_members, member, numbers
@@ -137,17 +137,32 @@ def list_frames(root: Path, split: str, subset: SubsetName, data_dict: str | Non
         raise UserError(f"there is no folder {root}: set `root` to OpenLane-V2's folder")
     file = root / (data_dict or SUBSETS[subset].data_dict)
     if data_dict == "folders" or (data_dict is None and not file.is_file()):
-        keys = [
-            FrameKey(split, path.parent.parent.name, path.stem.removesuffix("-ls"))
-            for path in (root / split).glob("*/info/*.json")
-        ]
+        keys = _in_folders(root, split)
         if not keys:
-            raise UserError(f"{root} holds no {split}/<segment>/info/<timestamp>.json: is it OpenLane-V2's folder?")
+            others = [name for name in SPLITS if _in_folders(root, name)]
+            remedy = _instead(split, others) if others else ": is it OpenLane-V2's folder?"
+            raise UserError(f"{root} holds no {split}/<segment>/info/<timestamp>.json{remedy}")
     else:
-        keys = frames_of(load_json(file), split, str(file))
+        content = load_json(file)
+        others = [name for name in SPLITS if isinstance(content, Mapping) and content.get(name) and name != split]
+        keys = [] if others and not content.get(split) else frames_of(content, split, str(file))
         if not keys:
-            raise UserError(f"{file} names no frame of split {split}: choose another split or split file (data_dict)")
+            remedy = _instead(split, others) if others else ": choose another split"
+            raise UserError(f"{file} names no frame of split {split}{remedy}, or another split file (data_dict)")
     return sorted(set(keys), key=lambda key: (key.segment, _time(key, root)))
+
+
+def _in_folders(root: Path, split: str) -> list[FrameKey]:
+    files = (root / split).glob("*/info/*.json")
+    return [FrameKey(split, path.parent.parent.name, path.stem.removesuffix("-ls")) for path in files]
+
+
+def _instead(split: str, others: Sequence[str]) -> str:
+    """Return the end of a message: which options take other splits, the only ones there, in place of one."""
+    return (
+        f", only of {' and '.join(others)}: choose --split {others[0]}, or in a run's settings, where data.train, "
+        f"data.val and data.test name the official split that serves as each, --data.{split} {others[0]}"
+    )
 
 
 def frames_of(content: Any, split: str, where: str) -> list[FrameKey]:

@@ -19,6 +19,7 @@ from tflane_jax.datasets.overlap import frame_drives
 from tflane_jax.datasets.procedural import REAL_LIKE_EXAMPLE
 from tflane_jax.datasets.road_maps import MapFile, chosen_maps
 from tflane_jax.datasets.streaming import StreamingConfig
+from tflane_jax.errors import UserError
 from tflane_jax.scene import Example
 from tflane_jax.scene.logs import Log
 
@@ -116,10 +117,26 @@ class RecordedData:
 
 
 def _choose(choice: Choice) -> RecordedConfig:
+    """Return the logs of the root: those of the split where the run's own data name them, else all.
+
+    Raises UserError where a split was asked for and nothing tells its logs.
+    """
     assert choice.root is not None
-    if isinstance(choice.configured, RecordedConfig):
-        return replace(choice.configured, root=choice.root)
-    return RecordedConfig(choice.root, example=replace(choice.configured.example, cameras=None))
+    configured = choice.configured
+    if isinstance(configured, RecordedConfig):
+        return replace(configured, root=choice.root)
+    example = replace(configured.example, cameras=None)
+    # `--splits` is for exports: they refuse data without images, and say so.
+    if not choice.split_given or choice.option == "--splits" or choice.root.name == choice.split:
+        return RecordedConfig(choice.root, example=example)
+    # Simulated scenes on maps (`RealMapConfig`) name the logs of a split too; training has all that others do not.
+    logs, without = getattr(configured, "logs", ()), getattr(configured, "without", ())
+    if not (logs or (choice.split == "train" and without)):
+        raise UserError(
+            f"nothing tells which recorded logs of {choice.root} are the split {choice.split}: leave --split out to "
+            "take all of them, or name a folder that holds only the logs to take with --root"
+        )
+    return RecordedConfig(choice.root, logs, without, example=example)
 
 
 SOURCE = DataSource(

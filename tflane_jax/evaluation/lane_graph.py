@@ -27,7 +27,7 @@ from tflane_jax.evaluation.interventions import with_traffic
 from tflane_jax.evaluation.lane_groups import LANE_GROUPS, lane_groups, line_groups
 from tflane_jax.evaluation.lane_segments import detections_of_segments, segment_truth
 from tflane_jax.evaluation.map_metrics import LineLabel, MapLineMetrics
-from tflane_jax.evaluation.predict import Predictor, predicted_batches
+from tflane_jax.evaluation.predict import FOR_SCORES, Predictor, predicted_batches
 from tflane_jax.evaluation.results import EvaluationConfig, SceneRatio, SceneSamples
 from tflane_jax.evaluation.vector_maps import measured_lines
 from tflane_jax.geometry import PerceptionRange
@@ -235,7 +235,7 @@ def evaluate_lanes(
     config = config or EvaluationConfig()
     sightings, metrics = Sightings(), LaneGraphMetrics(config.versions)
     changed = with_traffic(arrays, config.traffic)
-    predicted = predicted_batches(task, params, changed, config.batch_size, _without_images)
+    predicted = predicted_batches(task, params, changed, config.batch_size, _without_images, what=FOR_SCORES)
     originals = None if changed is arrays else ordered_batches(arrays, config.batch_size)
     for number, (indices, batch, answer) in enumerate(predicted):
         if originals is not None:

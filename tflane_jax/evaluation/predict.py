@@ -22,6 +22,9 @@ from tflane_jax.startup import compiled
 
 # Examples of one call of `predict_examples`: a model needs memory for the activations of all of them.
 _AT_ONCE = 16
+# What a stage of compiling is for: a training scores batches and draws a few examples, by two programs.
+PREDICTION = "the prediction"
+FOR_SCORES, FOR_PICTURES = f"{PREDICTION} for scores", f"{PREDICTION} for pictures"
 
 
 class Predictor(Protocol):
@@ -61,7 +64,9 @@ def predict_stream(task: Predictor, params: Params, memory: Any, frames: Any) ->
     return lax.scan(functools.partial(task.step, params), memory, frames)
 
 
-def predictions(task: Predictor, params: Params, arrays: Any, batch_size: int) -> Iterator[tuple[range, Prediction]]:
+def predictions(
+    task: Predictor, params: Params, arrays: Any, batch_size: int, *, what: str = PREDICTION
+) -> Iterator[tuple[range, Prediction]]:
     """Yield indices and stacked predictions (numpy) for all examples, in order.
 
     Args:
@@ -69,8 +74,9 @@ def predictions(task: Predictor, params: Params, arrays: Any, batch_size: int) -
         arrays: examples, see `datasets.batches`.
         batch_size: examples per call. The last batch is padded and its predictions cut, so that all batches use one
             compiled program.
+        what: what is computed, for the names of the stages that compile it.
     """
-    for indices, _, answers in predicted_batches(task, params, arrays, batch_size, lambda batch: None):
+    for indices, _, answers in predicted_batches(task, params, arrays, batch_size, lambda batch: None, what=what):
         yield indices, answers
 
 
@@ -80,6 +86,8 @@ def predicted_batches(
     arrays: Any,
     batch_size: int,
     needed: Callable[[Any], Any] | None = None,
+    *,
+    what: str = PREDICTION,
 ) -> Iterator[tuple[range, Any, Prediction]]:
     """Yield indices, stacked examples and stacked predictions; padding may add examples beyond the indices.
 
@@ -89,7 +97,7 @@ def predicted_batches(
 
     Args:
         task, params: the model.
-        arrays, batch_size: see `predictions`.
+        arrays, batch_size, what: see `predictions`.
         needed: batch -> what the caller reads of it, which alone is exchanged between processes; None for all.
     """
     mesh = None if task.streams else prediction_mesh(batch_size)
@@ -97,22 +105,22 @@ def predicted_batches(
     memory = task.start() if task.streams else None
     for indices, batch in ordered_batches(arrays, batch_size, part):
         if task.streams:
-            memory, answers = _run_compiled(predict_stream, task, params, memory, batch)
+            memory, answers = _run_compiled(predict_stream, what, task, params, memory, batch)
         else:
             rows = divided(batch, mesh) if mesh is not None else batch
-            answers = _run_compiled(predict_batch, task, params, rows, mesh)
+            answers = _run_compiled(predict_batch, what, task, params, rows, mesh)
             if part[1] > 1:
                 batch = all_rows(batch if needed is None else needed(batch))
         answers, kept = jax.device_get(answers), slice(len(indices))
         yield indices, batch, jax.tree.map(lambda leaf, kept=kept: leaf[kept], answers)
 
 
-def _run_compiled(program: Any, task: Predictor, *arguments: Any) -> Any:
+def _run_compiled(program: Any, what: str, task: Predictor, *arguments: Any) -> Any:
     """Return `program(task, *arguments)`; what it has to compile first is shown, and can be interrupted."""
     leaves, tree = jax.tree.flatten(arguments)
     kinds = tuple((jnp.shape(leaf), jnp.result_type(leaf)) for leaf in leaves if not isinstance(leaf, Mesh))
     if (key := (program, task, tree, kinds)) not in _compiled:
-        compiled(program, task, *arguments, what="the prediction")
+        compiled(program, task, *arguments, what=what)
         _compiled.add(key)
     return program(task, *arguments)
 
@@ -121,24 +129,25 @@ _compiled: set[Any] = set()
 
 
 def predict_examples(
-    task: Predictor, params: Params, dataset: Dataset, indices: Sequence[int]
+    task: Predictor, params: Params, dataset: Dataset, indices: Sequence[int], *, what: str = PREDICTION
 ) -> tuple[Example, Prediction]:
     """Return some examples with all their fields, and the predictions for them; both stacked, numpy.
 
-    A model with memory first processes the earlier frames of each example's scene.
+    A model with memory first processes the earlier frames of each example's scene. `what` as of `predictions`.
     """
     examples = stack_examples([dataset.example(index) for index in indices])
     if task.streams:
-        every = [_streamed(task, params, dataset, index) for index in indices]
+        every = [_streamed(task, params, dataset, index, what) for index in indices]
     else:
-        every = [answer for _, answer in predictions(task, params, examples, min(len(indices), _AT_ONCE))]
+        size = min(len(indices), _AT_ONCE)
+        every = [answer for _, answer in predictions(task, params, examples, size, what=what)]
     return examples, jax.tree.map(lambda *leaves: np.concatenate(leaves), *every)
 
 
-def _streamed(task: Predictor, params: Params, dataset: Dataset, index: int) -> Prediction:
+def _streamed(task: Predictor, params: Params, dataset: Dataset, index: int, what: str) -> Prediction:
     """Return the prediction for one example (leading axis 1), after the earlier frames of its scene."""
     frames = [dataset.example(index)]
     while frames[0].has_previous:
         frames.insert(0, dataset.example(index - len(frames)))
-    *_, (_, answer) = predictions(task, params, stack_examples(frames), 1)
+    *_, (_, answer) = predictions(task, params, stack_examples(frames), 1, what=what)
     return answer

@@ -27,7 +27,7 @@ def radius_mask(
     """Return the mask by which a query attends to the valid lines within `radius` of its place.
 
     Args:
-        places, lines: in one unit, that of `radius`; lines of at least two points. Invalid ones may hold anything.
+        places, lines: in one unit, that of `radius`; a line may be a single point. Invalid ones may hold anything.
         valid: of the lines.
         radius: largest distance.
     """
@@ -36,7 +36,11 @@ def radius_mask(
 
 
 def squared_line_distance(places: Float[Array, "q 2"], lines: Float[Array, "n p 2"]) -> Float[Array, "n q"]:
-    """Return the squared distance of every line, of at least two points, to every place."""
+    """Return the squared distance of every line to every place; infinity from lines without points."""
+    if not lines.shape[1]:
+        return jnp.full((len(lines), len(places)), jnp.inf, places.dtype)
+    if lines.shape[1] == 1:
+        lines = jnp.repeat(lines, 2, 1)  # a point is a segment without length
     # Segment by segment, coordinates apart: a CPU vectorises the minimum of arrays, not that over an axis of segments.
     x, y = places[None, :, 0], places[None, :, 1]
     segments = [_squared_segment_distance(x, y, lines[:, i], lines[:, i + 1]) for i in range(lines.shape[1] - 1)]
@@ -63,10 +67,11 @@ def track_distance(
         tracks: positions in the same unit; invalid ones may hold anything.
         valid: of the positions.
     """
-    lines = jnp.repeat(lanes, 2, 1) if lanes.shape[1] == 1 else lanes
+    if not valid.shape[1]:
+        return jnp.full((len(lanes), len(tracks)), jnp.inf, lanes.dtype)
     # Tracks are the last axis, so that the minimum over positions vectorises as well.
     places = jnp.where(valid[..., None], tracks, 0.0).swapaxes(0, 1).reshape(-1, 2)
-    square = squared_line_distance(places, lines).reshape(len(lanes), *valid.T.shape)
+    square = squared_line_distance(places, lanes).reshape(len(lanes), *valid.T.shape)
     return jnp.sqrt(jnp.where(valid.T[None], square, jnp.inf).min(1))
 
 

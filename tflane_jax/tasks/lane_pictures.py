@@ -27,7 +27,7 @@ from tflane_jax.evaluation.found_lanes import (
 )
 from tflane_jax.evaluation.interventions import scene_numbers
 from tflane_jax.evaluation.lane_groups import lane_groups, line_groups
-from tflane_jax.evaluation.predict import predict_examples, predicted_batches
+from tflane_jax.evaluation.predict import FOR_PICTURES, predict_examples, predicted_batches
 from tflane_jax.scene import (
     CenterlinePrediction,
     Example,
@@ -61,7 +61,7 @@ def draw_examples(
     """Write pictures of some examples to a folder, from above and, where there are any, in their camera images."""
     from tflane_jax.plots import save_camera_views, save_examples
 
-    examples, answer = predict_examples(model.task, model.params, dataset, indices)
+    examples, answer = predict_examples(model.task, model.params, dataset, indices, what=FOR_PICTURES)
     found = lanes_of(answer)
     path, names = folder / f"step_{step:08d}.png", titles(dataset, indices)
     ground, view = source.example.ground, source.example.range
@@ -87,7 +87,7 @@ def draw_hidden_lanes(
         indices = np.argsort(-hidden, kind="stable")[:_FRAMES_OF_ONE_MODEL].tolist()
     examples = stack_examples([dataset.example(index) for index in indices])
     found = {
-        name: lanes_of(predict_examples(model.task, model.params, dataset, indices)[1])
+        name: lanes_of(predict_examples(model.task, model.params, dataset, indices, what=FOR_PICTURES)[1])
         for name, model in models.items()
     }
     ground, view = source.example.ground, source.example.range
@@ -184,7 +184,7 @@ def _caption(answers: Mapping[str, _Answers], ahead: Mapping[str, Sequence[int]]
 def _answers(model: Model, data: Example | Streamed, field: Field) -> _Answers:
     """Return what a model predicts for a whole split."""
     confidences, valid, lanes, scores = [], [], [], []
-    for indices, batch, answer in predicted_batches(model.task, model.params, data, _BATCH):
+    for indices, batch, answer in predicted_batches(model.task, model.params, data, _BATCH, what=FOR_PICTURES):
         lanes.append(lanes_of(answer))
         scores.append(lane_scores(lanes[-1]))
         for row in range(len(indices)):

@@ -26,7 +26,15 @@ from tflane_jax.datasets.streaming import Prepare, Streamed
 from tflane_jax.datasets.tusimple import TuSimpleConfig
 from tflane_jax.evaluation import lane_shapes
 from tflane_jax.evaluation.by_scene import summed_ratio
-from tflane_jax.evaluation.predict import Predictor, predict_batch, predicted_batches, predictions
+from tflane_jax.evaluation.predict import (
+    FOR_PICTURES,
+    FOR_SCORES,
+    PREDICTION,
+    Predictor,
+    predict_batch,
+    predicted_batches,
+    predictions,
+)
 from tflane_jax.evaluation.results import Evaluation, EvaluationConfig
 from tflane_jax.files.tusimple import RowLanes
 from tflane_jax.layers.batch_norm import BATCH_AXIS, STATISTICS
@@ -143,7 +151,9 @@ class LaneShapeTask(Task[RoadImage, LabelledImages, ImageSource, None]):
     ) -> Evaluation:
         """Return TuSimple's metrics, and the loss of the last decoder layer as validation loss; without groups."""
         metrics, losses = TuSimpleMetrics(), []
-        predicted = predicted_batches(self, params, data.images, config.batch_size, lambda b: b.replace(image=None))
+        predicted = predicted_batches(
+            self, params, data.images, config.batch_size, lambda b: b.replace(image=None), what=FOR_SCORES
+        )
         for indices, batch, answer in predicted:
             lines = jax.tree.map(lambda leaf, i=indices: leaf[: len(i)], batch.lines)
             losses += [float(_loss(self, answer.curves, lines))] * len(indices)
@@ -169,7 +179,7 @@ class LaneShapeTask(Task[RoadImage, LabelledImages, ImageSource, None]):
 
         def draw(folder: Path, step: int, params: Params) -> None:
             if examples is not None:
-                answer = predict_curves(self, params, examples)
+                answer = predict_curves(self, params, examples, what=FOR_PICTURES)
                 save_road_images(folder / "pictures" / f"step_{step:08d}.png", examples, {f"step {step}": answer})
 
         return draw
@@ -182,7 +192,10 @@ class LaneShapeTask(Task[RoadImage, LabelledImages, ImageSource, None]):
 
         examples = chosen_examples(data.images, spread(count(data.images), _COMPARED_EXAMPLES))
         save_edge_types(models, examples, path.with_name("edge_types"))
-        answers = {name: predict_curves(model.task, model.params, examples) for name, model in models.items()}
+        answers = {
+            name: predict_curves(model.task, model.params, examples, what=FOR_PICTURES)
+            for name, model in models.items()
+        }
         return save_road_images(path, examples, answers)
 
     def remarks(self, params: Params) -> dict[str, str]:
@@ -212,7 +225,7 @@ def found_lanes(prediction: CurvePrediction, truth: RowLanes, threshold: float |
 
 
 def predict_curves(
-    task: Predictor, params: Params, examples: RoadImage, *, at_once: int | None = None
+    task: Predictor, params: Params, examples: RoadImage, *, at_once: int | None = None, what: str = PREDICTION
 ) -> CurvePrediction:
     """Return the curves predicted for stacked images, as numpy arrays; raise ValueError for a task without them.
 
@@ -220,9 +233,10 @@ def predict_curves(
         task, params: the model.
         examples: B of them, stacked.
         at_once: images of one call of the model, which needs memory for the activations of all; None: B.
+        what: see `evaluation.predict.predictions`.
     """
     size = min(len(examples.image), at_once or len(examples.image))
-    every = [answer for _, answer in predictions(task, params, examples, size)]
+    every = [answer for _, answer in predictions(task, params, examples, size, what=what)]
     answer = jax.tree.map(lambda *leaves: np.concatenate(leaves), *every)
     if answer.curves is None:
         raise ValueError("this task predicts no lane shapes")

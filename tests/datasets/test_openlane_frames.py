@@ -1,0 +1,36 @@
+"""Which frames a folder of OpenLane-V2 has."""
+
+import json
+
+import pytest
+
+from tflane_jax.datasets.openlane_frames import list_frames
+from tflane_jax.errors import UserError
+
+
+def listed(root, split, segments, data_dict):
+    """Write a split of segments with one frame each, and the split file."""
+    for segment in segments:
+        path = root / split / segment / "info" / "1.json"
+        path.parent.mkdir(parents=True)
+        path.touch()
+    frames = {split: {segment: ["1.json"] for segment in segments}, "val": {}}
+    if data_dict is not None:
+        (root / data_dict).write_text(json.dumps(frames))
+
+
+@pytest.mark.parametrize("data_dict", [None, "data_dict_subset_A.json"])
+def test_a_root_with_one_split_names_the_options_that_take_it(tmp_path, data_dict):
+    """Regression: "is it OpenLane-V2's folder?" of a folder with the split train alone."""
+    listed(tmp_path, "train", ("2", "1"), data_dict)
+    assert [key.segment for key in list_frames(tmp_path, "train", "A")] == ["1", "2"]
+    for split in ("val", "test"):
+        with pytest.raises(UserError, match=r", only of train: choose --split train, or in a run's settings, ") as told:
+            list_frames(tmp_path, split, "A")
+        assert f"--data.{split} train" in str(told.value)
+        assert ("data_dict)" in str(told.value)) == (data_dict is not None)
+
+
+def test_a_folder_without_frames_is_none_of_openlane_v2(tmp_path):
+    with pytest.raises(UserError, match=r"holds no val/<segment>/info/<timestamp>\.json: is it OpenLane-V2's folder"):
+        list_frames(tmp_path, "val", "A")

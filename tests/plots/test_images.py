@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from tflane_jax.plots.images import lanes_drawn, predicted_lines, save_photo
+from tests.models.images import road_images
+from tflane_jax.plots.images import lanes_drawn, predicted_lines, save_photo, save_road_images
 from tflane_jax.scene import CurvePrediction
 
 
@@ -42,3 +43,18 @@ def test_the_picture_of_a_narrow_photo_is_of_bounded_height(tmp_path, size, draw
     path = save_photo(tmp_path / "photo.png", np.full((*size, 3), 90, np.uint8), [], "a photo")
     with Image.open(path) as picture:
         assert picture.size == (1056, pytest.approx(drawn, abs=5))
+
+
+@pytest.mark.parametrize(("count", "across", "down"), [(1, 1, 1), (3, 3, 1), (8, 4, 2), (9, 4, 3)])
+def test_images_without_predictions_share_rows(tmp_path, count, across, down):
+    """Eight of them below each other made a picture five times as high as wide."""
+    pytest.importorskip("matplotlib")
+    from PIL import Image
+
+    images = road_images(count)
+    height, width = images.image.shape[1:3]
+    with Image.open(save_road_images(tmp_path / "sheet.png", images)) as picture:
+        assert picture.size == (across * 528, pytest.approx(down * (528 * height / width + 27.5), abs=2))
+    prediction = CurvePrediction(logits=np.tile([0.0, 1.0], (count, 3, 1)), curves=np.full((count, 3, 8), 0.5))
+    with Image.open(save_road_images(tmp_path / "beside.png", images, {"a": prediction})) as picture:
+        assert picture.size == (2 * 528, pytest.approx(count * (528 * height / width + 27.5), abs=2))

@@ -11,6 +11,8 @@ from jaxtyping import Float
 from tflane_jax.plots.figure import hide_unused, new_figure, save_figure
 
 _BINS = 24
+# A quantity of fewer values than this, all whole numbers, has a tick for each: 0 and 1, and nothing between them.
+_TICKS = 8
 # The axis ends at this quantile of all values, so that a few large ones do not squeeze the others.
 _SHOWN = 0.99
 
@@ -28,13 +30,15 @@ def save_distributions(path: Path, values: Mapping[str, Mapping[str, Float[np.nd
     for ax, name in zip(axes.flat, names, strict=False):
         every = np.concatenate([found[name] for found in values.values() if name in found])
         low, high = float(every.min(initial=0.0)), float(np.quantile(every, _SHOWN)) if len(every) else 1.0
-        whole = bool(np.all(every == np.round(every))) and high - low < 2 * _BINS
-        edges = np.arange(low - 0.5, high + 1.5) if whole else np.linspace(low, max(high, low + 1e-6), _BINS + 1)
+        whole = bool(np.all(every == np.round(every)))
+        edges = _edges(low, high, whole=whole)
         for number, (dataset, found) in enumerate(values.items()):
             if len(found.get(name, ())):
                 count, _ = np.histogram(np.clip(found[name], edges[0], edges[-1]), edges)
                 ax.stairs(count / len(found[name]), edges, color=f"C{number}", lw=1.3, label=dataset)
         ax.set_title(name, fontsize=8, loc="left")
+        if whole and high - low < _TICKS:
+            ax.set_xticks(np.arange(low, high + 1))
         ax.tick_params(labelsize=6)
         ax.grid(alpha=0.3, lw=0.5)
     if names:
@@ -43,3 +47,11 @@ def save_distributions(path: Path, values: Mapping[str, Mapping[str, Float[np.nd
         ax.set_ylabel("fraction", fontsize=7)
     hide_unused(axes, len(names))
     return save_figure(figure, path)
+
+
+def _edges(low: float, high: float, *, whole: bool) -> Float[np.ndarray, " _"]:
+    """Return the edges of at most `_BINS` bins; each of whole numbers holds as many of them as the others."""
+    if not whole:
+        return np.linspace(low, max(high, low + 1e-6), _BINS + 1)
+    each = max(1, int(np.ceil((high - low + 1) / _BINS)))
+    return np.arange(low - 0.5, high + each + 0.5, each)

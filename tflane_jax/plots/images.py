@@ -14,7 +14,7 @@ from jaxtyping import Float, UInt8
 from tflane_jax.evaluation.lane_shapes import left_to_right
 from tflane_jax.files.images import opencv
 from tflane_jax.geometry.lane_shapes import curve_columns
-from tflane_jax.plots.figure import new_figure, save_figure
+from tflane_jax.plots.figure import hide_unused, new_figure, save_figure
 from tflane_jax.scene import CurvePrediction, LaneLines, RoadImage
 
 if TYPE_CHECKING:
@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 LANE_COLOURS = ("#ff4d6d", "#ffd166", "#4dd2ff", "#7ae582", "#c792ea", "#ff9d3c", "#f5f5f5")
 TRUTH = "#8be28b"
 _POINTS = 100
+# Images in a row of a sheet without predictions.
+_COLUMNS = 4
 _TALLEST = 19.2  # inches of the picture of one photo; portraits of a phone need 17
 
 
@@ -36,6 +38,8 @@ def save_road_images(
     threshold: float | None = None,
 ) -> Path:
     """Write one row per image: truth, then one column per model with the truth as thin dashes; return the path.
+
+    Without predictions, several images share a row.
 
     Args:
         path: .png, .pdf or .svg.
@@ -53,15 +57,18 @@ def save_road_images(
     if any(size != count for size in sizes.values()):
         raise ValueError(f"{count} images, but {sizes}")
     height, width = examples.image.shape[1:3]
-    figure, axes = new_figure(count, 1 + len(predictions), panel=(4.8, 4.8 * height / width + 0.25))
-    for row, title in enumerate(titles):
-        example, (truth, *columns) = _pick(examples, row), axes[row]
+    columns = 1 + len(predictions) if predictions else min(count, _COLUMNS)
+    rows = count if predictions else -(-count // columns)
+    figure, axes = new_figure(rows, columns, panel=(4.8, 4.8 * height / width + 0.25))
+    for row, (title, panels) in enumerate(zip(titles, axes.reshape(-1, 1 + len(predictions)), strict=False)):
+        example, (truth, *others) = _pick(examples, row), panels
         draw_image(truth, example.image, f"{title}: truth")
         draw_lines(truth, example.lines, (height, width), width=1.6)
-        for ax, (name, stacked) in zip(columns, predictions.items(), strict=True):
+        for ax, (name, stacked) in zip(others, predictions.items(), strict=True):
             draw_image(ax, example.image, name)
             draw_lines(ax, example.lines, (height, width), width=0.9, style="--")
             draw_lanes(ax, predicted_lines(_pick(stacked, row), threshold) * [width, height])
+    hide_unused(axes, count * (1 + len(predictions)))
     return save_figure(figure, path)
 
 

@@ -9,7 +9,7 @@ from tests.markers.test_simulation import markers_at, standing
 from tflane_jax.datasets.base import ExampleConfig
 from tflane_jax.datasets.marker_observations import marker_observations, store_of_log
 from tflane_jax.errors import UserError
-from tflane_jax.markers.image_search import DetectorConfig
+from tflane_jax.markers.image_search import DetectorConfig, find_markers
 from tflane_jax.markers.observe import observe
 from tflane_jax.markers.pixels import PixelConfig, detect_in_world
 from tflane_jax.markers.simulation import MarkerConfig, MarkerSimulationConfig
@@ -66,6 +66,21 @@ def test_a_moment_between_key_frames_can_be_drawn(scene):
     late = replace(scene, keyframes=scene.keyframes[5:])
     poses = [detect_in_world(one, scene.keyframes[5], scene.markers, rig, config).pose[0] for one in (late, scene)]
     np.testing.assert_allclose(poses[0], poses[1], atol=0.05)
+
+
+@pytest.mark.parametrize(("named", "searched"), [(None, (0, 1)), ((1, 5), (1, 5))])
+def test_boards_are_searched_by_the_ids_of_the_store_unless_others_are_named(scene, monkeypatch, named, searched):
+    given, rig = [], replace(CAMERAS, scale=0.33, markers=True)
+
+    def find(image, detector):
+        given.append(detector.ids)
+        return find_markers(image, detector)
+
+    monkeypatch.setattr("tflane_jax.markers.pixels.find_markers", find)
+    config = PixelConfig(detector=DetectorConfig(ids=named))
+    assert scene.markers.marker_id.tolist() == [0, 1]
+    detect_in_world(scene, scene.keyframes[5], scene.markers, rig, config)
+    assert set(given) == {searched}
 
 
 def test_logs_without_boards_in_images_are_refused(scene):

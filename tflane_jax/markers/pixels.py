@@ -34,7 +34,7 @@ class PixelConfig:
     Attributes:
         rig: cameras of an example without images of its own; an example with cameras is searched in those, at native
             size.
-        detector: settings; the size of the boards comes from the store.
+        detector: settings; the size of the boards comes from the store, as do their ids where it names none.
         range: boards farther from the vehicle are not drawn, metres.
     """
 
@@ -66,6 +66,10 @@ def detect_in_world(
             f"{log.name} has no boards in images: markers from pixels need the built-in world; simulate them "
             "(MarkerConfig.pixels = None), or use tflane markers run for images of a real drive"
         )
+    sizes = dict.fromkeys(np.asarray(markers.marker_id).tolist(), float(markers.size))
+    detector = config.detector
+    if detector.ids is None:
+        detector = replace(detector, ids=tuple(sorted(sizes)))
     cameras = draw_rig(log.seed, rig)
     poses = relative_pose(moment.global_from_ego, markers.pose)
     near = np.flatnonzero(np.linalg.norm(poses[:, :2, 3], axis=-1) <= config.range)
@@ -73,14 +77,13 @@ def detect_in_world(
     for number, camera in enumerate(cameras):
         parts = []
         for pose in poses[near]:
-            window = _window(pose, markers.size, camera, config.detector)
+            window = _window(pose, markers.size, camera, detector)
             if window is not None:
                 corner, size = window
                 pixels = render_window(log, moment, rig, corner, size, camera=number)
-                parts.append(_shifted(find_markers(pixels, config.detector), corner))
+                parts.append(_shifted(find_markers(pixels, detector), corner))
         found.append(joined(parts))
-    sizes = dict.fromkeys(np.asarray(markers.marker_id).tolist(), float(markers.size))
-    return locate(_empty_views(cameras), found, config.detector, sizes)
+    return locate(_empty_views(cameras), found, detector, sizes)
 
 
 def _window(

@@ -1,5 +1,8 @@
 """BEV cells through which lanes pass, and the auxiliary loss on them."""
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,8 +10,9 @@ import pytest
 
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.losses import lane_cells as losses
-from tflane_jax.losses.lane_cells import lane_cell_loss
-from tflane_jax.models.auxiliary import CELL_CHANNELS
+from tflane_jax.losses.auxiliary import auxiliary_losses
+from tflane_jax.losses.lane_cells import lane_cell_loss, used_lanes
+from tflane_jax.models.auxiliary import CELL_CHANNELS, AuxiliaryOutputs
 from tflane_jax.scene import LaneGraph
 
 RANGE = PerceptionRange((0.0, 8.0), (0.0, 4.0), (-1.0, 1.0))
@@ -103,3 +107,37 @@ def test_the_truth_has_the_least_loss():
     perfect = jnp.concatenate([jnp.where(cells.inside, 20.0, -20.0)[..., None], cells.offset, cells.direction], -1)
     assert lane_cell_loss(perfect, lanes, RANGE) < 1e-6
     assert lane_cell_loss(perfect.at[..., 0].multiply(-1), lanes, RANGE) > 10.0
+
+
+@pytest.mark.parametrize("valid", [(), (0, 2), (0, 1, 2), (1, 3)])
+def test_padding_after_the_last_valid_lane_of_a_batch_is_not_looked_at(valid):
+    """All numbers are bit by bit those of a loop over every lane; the lanes that are left out may hold anything."""
+    rng = np.random.default_rng(len(valid))
+    points = rng.uniform(0.0, 4.0, (2, 5, 4, 3)).astype(np.float32) * np.float32([2.0, 1.0, 0.0])
+    mask = np.zeros((2, 5), bool)
+    mask[1, list(valid)] = mask[0, list(valid[:1])] = True
+    blank = graph(capacity=5)
+    lanes = [
+        jax.tree.map(jnp.asarray, replace(blank, points=np.where(there[:, None, None], of, np.nan), valid=there))
+        for of, there in zip(points, mask, strict=True)
+    ]
+    batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *lanes)
+    used = used_lanes(batch.valid)
+    assert used == max(valid, default=-1) + 1
+    said = jnp.asarray(rng.normal(size=(2, *SHAPE, CELL_CHANNELS)).astype(np.float32))
+    loss = jax.value_and_grad(lambda *each: jax.vmap(lane_cell_loss, (0, 0, None, None))(*each).sum())
+    whole, short = (jax.jit(loss, static_argnums=2)(said, batch, RANGE, count) for count in (5, used))
+    jax.tree.map(np.testing.assert_array_equal, whole, short)
+
+
+def test_a_batch_of_few_lanes_takes_few_rounds(monkeypatch):
+    """Regression: the loop went over the padding, too."""
+    rounds = []
+    loop = SimpleNamespace(fori_loop=lambda lower, upper, body, start: (rounds.append(int(upper) - lower), start)[1])
+    monkeypatch.setattr(losses, "lax", loop)
+    one, none = graph([[0.0, 0.5, 0], [4.0, 2.0, 0], [8.0, 3.5, 0]], capacity=50), LaneGraph.empty(50, 3)
+    batch = jax.tree.map(lambda *leaves: jnp.stack(list(map(jnp.asarray, leaves))), none, one)
+    outputs = AuxiliaryOutputs(lane_cells=jnp.zeros((2, *SHAPE, CELL_CHANNELS)))
+    weights = {"cell_weight": 1.0, "proposal_weights": (1.0, 1.0), "denoising": None}
+    auxiliary_losses(outputs, ("lane_cells",), batch, bev_range=RANGE, **weights)
+    assert rounds == [2]

@@ -13,8 +13,11 @@ from tests.models.cases import (
     ELEMENTS,
     LINES,
     SEGMENTS,
+    SMALL_LINES,
+    WITH_TRAFFIC,
     make_bucket_example,
     make_camera_example,
+    make_example,
     make_line_example,
 )
 from tests.slow import with_slow
@@ -45,6 +48,17 @@ def test_every_host_starts_as_published(name):
         for initial in ("lecun", "xavier")
     ]
     jax.tree.map(lambda a, b: np.testing.assert_equal((a.shape, a.dtype), (b.shape, b.dtype)), *variables)
+
+
+@pytest.mark.parametrize("name", with_slow([*HOSTS, "traffic", "spread lines"], quick=["toponet", "traffic"]))
+def test_parameters_and_statistics_are_float32_in_64_bit_mode_too(name):
+    """Regression: cameras could not be initialised there, and own parameters of modules had 64 bits."""
+    others = {"traffic": (WITH_TRAFFIC, make_example), "spread lines": (SMALL_LINES, make_line_example)}
+    config, make = (HOSTS | others)[name]
+    with jax.enable_x64(True):
+        found = jax.eval_shape(LaneGraphTask(config).init, jax.random.key(0), make())
+    wide = [path for path, leaf in jax.tree_util.tree_leaves_with_path(found) if leaf.dtype != np.float32]
+    assert not wide, list(map(jax.tree_util.keystr, wide))
 
 
 @pytest.mark.parametrize(

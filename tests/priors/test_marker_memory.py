@@ -194,3 +194,20 @@ def test_gradients_are_finite_where_nothing_was_seen():
         ].weight.sum()
 
     assert np.isfinite(jax.grad(total)(jnp.zeros(LANES))).all()
+
+
+def test_a_stream_keeps_its_numbers_and_dtypes_in_64_bit_mode():
+    """Regression: the bank became float64 after the first frame, and a scan over frames was refused."""
+    frames, poses = frames_and_poses()
+    stacked, going = jax.tree.map(lambda *leaves: np.stack(leaves), *frames), np.arange(len(frames)) > 0
+    _, expected = run(frames, poses=poses)
+    with jax.enable_x64(True):
+        last, used = lax.scan(
+            lambda memory, now: remember(memory, *now, CONFIG),
+            jax.tree.map(jnp.asarray, MarkerMemory.empty(4, LANES, POINTS)),
+            (stacked, poses, going),
+        )
+    assert [leaf.dtype for leaf in jax.tree.leaves(last)] == [np.float32, np.float32, bool, bool]
+    for name, leaf in vars(used).items():
+        assert leaf.dtype in (np.float32, bool)
+        np.testing.assert_allclose(leaf, np.stack([getattr(one, name) for one in expected]), rtol=1e-5, atol=1e-6)

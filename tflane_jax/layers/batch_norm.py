@@ -34,14 +34,14 @@ class BatchNorm(nn.Module):
     def __call__(self, x: Float[Array, "*b c"], *, train: bool) -> Float[Array, "*b c"]:
         """Return the normalised features; `train` takes the batch's own statistics and updates the running ones."""
         channels = x.shape[-1]
-        mean = self.variable(STATISTICS, "mean", jnp.zeros, channels)
-        variance = self.variable(STATISTICS, "var", jnp.ones, channels)
+        mean = self.variable(STATISTICS, "mean", jnp.zeros, channels, jnp.float32)
+        variance = self.variable(STATISTICS, "var", jnp.ones, channels, jnp.float32)
         if self.frozen:
-            scale = self.variable(STATISTICS, "scale", jnp.ones, channels).value
-            bias = self.variable(STATISTICS, "bias", jnp.zeros, channels).value
+            scale = self.variable(STATISTICS, "scale", jnp.ones, channels, jnp.float32).value
+            bias = self.variable(STATISTICS, "bias", jnp.zeros, channels, jnp.float32).value
         else:
-            scale = self.param("scale", nn.initializers.ones, (channels,))
-            bias = self.param("bias", nn.initializers.zeros, (channels,))
+            scale = self.param("scale", nn.initializers.ones, (channels,), jnp.float32)
+            bias = self.param("bias", nn.initializers.zeros, (channels,), jnp.float32)
         used_mean, used_variance = mean.value, variance.value
         if train and not self.frozen:
             used_mean, used_variance, count = self._batch_statistics(x)

@@ -105,7 +105,7 @@ def offsets_and_logits(
     offsets = nn.Dense(
         heads * levels * points * 2,
         kernel_init=nn.initializers.zeros,
-        bias_init=lambda *_: jnp.asarray(bias),
+        bias_init=lambda *_: jnp.asarray(bias, jnp.float32),
         dtype=dtype,
         name="sampling_offsets",
     )(query)

@@ -140,11 +140,13 @@ class GraphTransformer(nn.Module):
     @nn.compact
     def __call__(self, adjacency: Float[Array, "e n n"], x: Float[Array, "n d"]) -> Float[Array, "n f"]:
         """Return the node features of all channels side by side, f = channels * dim."""
-        weights = self.param("selection", _selection_init, (self.layers + 1, self.channels, adjacency.shape[0]))
+        weights = self.param(
+            "selection", _selection_init, (self.layers + 1, self.channels, adjacency.shape[0]), jnp.float32
+        )
         graphs = meta_path_graphs(adjacency, weights, self.variant)
         out = convolve(graphs, nn.Dense(self.dim, use_bias=False, name="convolution")(x), self.variant)
         if self.variant.bias:
-            out = out + self.param("bias", nn.initializers.zeros_init(), (self.dim,))[None, None]
+            out = out + self.param("bias", nn.initializers.zeros_init(), (self.dim,), jnp.float32)[None, None]
         return nn.relu(out).swapaxes(0, 1).reshape(x.shape[0], self.channels * self.dim)
 
 
@@ -172,7 +174,7 @@ class FastGraphTransformer(nn.Module):
     def __call__(self, adjacency: Float[Array, "e n n"], x: Float[Array, "n d"]) -> Float[Array, "n f"]:
         """Return the node features, f = dim; `adjacency` has receivers as rows, which sum to 1."""
         types = adjacency.shape[0] + (self.non_local is not None)
-        weights = self.param("selection", _selection_init, (self.hops, self.channels, types))
+        weights = self.param("selection", _selection_init, (self.hops, self.channels, types), jnp.float32)
         projected = nn.Dense(self.channels * self.dim, use_bias=False, name="projection")(x)
 
         def mix(hop, by_type, h):

@@ -76,7 +76,7 @@ class LearnedImageEncoding(nn.Module):
         """Return the encoding of a map of `height` x `width` cells; raises ValueError where that is too large."""
         if height > self.rows or width > self.columns:
             raise ValueError(f"positions are learned up to {self.rows} x {self.columns}, not {height} x {width}")
-        row = self.param("row", self.init_table, (self.rows, self.bands))[:height, None]
-        column = self.param("column", self.init_table, (self.columns, self.bands))[None, :width]
+        row = self.param("row", self.init_table, (self.rows, self.bands), jnp.float32)[:height, None]
+        column = self.param("column", self.init_table, (self.columns, self.bands), jnp.float32)[None, :width]
         shape = (height, width, self.bands)
         return jnp.concatenate([jnp.broadcast_to(column, shape), jnp.broadcast_to(row, shape)], -1)

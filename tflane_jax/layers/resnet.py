@@ -116,7 +116,7 @@ class StemConvolution(nn.Module):
     def __call__(self, x: Float[Array, "v h w c"]) -> Float[Array, "v ho wo co"]:
         """Return the features."""
         v, h, w, c = x.shape
-        kernel = self.param("kernel", _INIT, (7, 7, c, self.channels))
+        kernel = self.param("kernel", _INIT, (7, 7, c, self.channels), jnp.float32)
         x, kernel = (a.astype(self.dtype or a.dtype) for a in (x, kernel))
         layout = ("NHWC", "HWIO", "NHWC")
         if h % 2 or w % 2:

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float
 
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.losses.common import Report, Terms, last_layer
-from tflane_jax.losses.lane_cells import lane_cell_loss
+from tflane_jax.losses.lane_cells import lane_cell_loss, used_lanes
 from tflane_jax.losses.lane_proposals import lane_proposal_sums
 from tflane_jax.matching import Assignment
 from tflane_jax.models.auxiliary import AuxiliaryName, AuxiliaryOutputs
@@ -54,9 +54,10 @@ def auxiliary_losses(
             losses.append(sum(term.sum() for term in terms.values()))
             report |= {f"denoised_{key}": value for key, value in last_layer(terms).items()}
         elif name == "lane_cells" and outputs.lane_cells is not None:
-            each = jax.vmap(lane_cell_loss, in_axes=(0, 0, None))
+            each = jax.vmap(lane_cell_loss, in_axes=(0, 0, None, None))
             inside = lanes if cell_lanes is None else cell_lanes
-            report["cells"] = cell_weight * each(outputs.lane_cells, inside, bev_range).mean()
+            used = used_lanes(inside.valid)
+            report["cells"] = cell_weight * each(outputs.lane_cells, inside, bev_range, used).mean()
             losses.append(report["cells"])
         elif name == "lane_proposals" and outputs.lane_proposals is not None:
             each = jax.vmap(partial(lane_proposal_sums, range_=bev_range))

@@ -39,13 +39,16 @@ class LaneCells(NamedTuple):
     direction: Float[Array, "h w 2"]
 
 
-def lane_cells(lanes: LaneGraph, shape: tuple[int, int], range_: PerceptionRange) -> LaneCells:
+def lane_cells(
+    lanes: LaneGraph, shape: tuple[int, int], range_: PerceptionRange, used: int | Int[Array, ""] | None = None
+) -> LaneCells:
     """Return the targets of all cells from the valid lanes of one example.
 
     Args:
         lanes: ground truth; padding may hold anything. A lane may repeat points; one of a single place counts as none.
         shape: rows (along y) and columns (along x) of the grid.
         range_: the box that the grid covers, metres.
+        used: all lanes from this one on are padding, see `used_lanes`; None looks at every lane.
     """
     h, w = shape
     count = jnp.array([w, h], jnp.float32)
@@ -79,7 +82,8 @@ def lane_cells(lanes: LaneGraph, shape: tuple[int, int], range_: PerceptionRange
     # One segment after the other: on CPU, minima over a table of cells x segments take 24 times as long.
     far, zero = jnp.full((h, w), jnp.inf), jnp.zeros((h, w))
     start = (far, far, zero, zero, jnp.zeros((h, w), jnp.int32))
-    squared, apart, x, y, nearest = lax.fori_loop(0, len(begin), compare, start)
+    pieces = len(begin) if used is None else used * (points.shape[1] - 1)
+    squared, apart, x, y, nearest = lax.fori_loop(0, pieces, compare, start)
     near = squared <= _RADIUS**2
     metres = step * jnp.asarray(range_.size(2), jnp.float32)[None] / count[None]
     direction = (metres / jnp.sqrt((metres**2).sum(-1, keepdims=True) + 1e-6))[nearest]
@@ -87,14 +91,24 @@ def lane_cells(lanes: LaneGraph, shape: tuple[int, int], range_: PerceptionRange
     return LaneCells(apart < 0.5, near, offset, direction)
 
 
-def lane_cell_loss(cells: Float[Array, "h w 5"], lanes: LaneGraph, range_: PerceptionRange) -> Float[Array, ""]:
+def used_lanes(valid: Bool[Array, "b l"]) -> Int[Array, ""]:
+    """Return the number of lanes after which all examples of a batch have padding alone.
+
+    One number for all: under `vmap`, a loop with a length for each example selects between whole grids in every round.
+    """
+    return jnp.where(valid.any(0), jnp.arange(1, valid.shape[1] + 1), 0).max(initial=0)
+
+
+def lane_cell_loss(
+    cells: Float[Array, "h w 5"], lanes: LaneGraph, range_: PerceptionRange, used: int | Int[Array, ""] | None = None
+) -> Float[Array, ""]:
     """Return the loss of one example.
 
     Cross entropy of the occupancy, with equal total weight for cells with and without a lane, plus the mean L1 error of
-    offset and direction over cells near a lane.
+    offset and direction over cells near a lane. `used` as of `lane_cells`.
     """
     h, w, _ = cells.shape
-    true = lane_cells(lanes, (h, w), range_)
+    true = lane_cells(lanes, (h, w), range_, used)
     entropy = optax.sigmoid_binary_cross_entropy(cells[..., 0], true.inside.astype(cells.dtype))
     error = jnp.abs(cells[..., 1:] - jnp.concatenate([true.offset, true.direction], -1)).sum(-1)
     return 0.5 * (_mean(entropy, true.inside) + _mean(entropy, ~true.inside)) + _mean(error, true.near)

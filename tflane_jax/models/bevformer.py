@@ -94,13 +94,15 @@ class BevFormer(nn.Module):
                 f"{len(features)} levels of {len(cameras.valid)}: change `levels` and `cameras` of BevFormerConfig"
             )
         of_queries, of_positions = _INITIAL[config.initial]
-        queries = self.param("queries", of_queries, (grid.rows * grid.columns, config.dim))
+        queries = self.param("queries", of_queries, (grid.rows * grid.columns, config.dim), jnp.float32)
         queries = queries + MotionEmbedding(config.dim, name="motion")(motion)[None]
         learned = LearnedImageEncoding(grid.rows, grid.columns, config.dim // 2, of_positions, name="position")
         position = learned(grid.rows, grid.columns).reshape(-1, config.dim)
 
-        by_camera = self.param("cameras", _NORMAL, (config.cameras, config.dim))[: len(cameras.valid), None]
-        by_level = self.param("levels", _NORMAL, (config.levels, config.dim))
+        by_camera = self.param("cameras", _NORMAL, (config.cameras, config.dim), jnp.float32)[
+            : len(cameras.valid), None
+        ]
+        by_level = self.param("levels", _NORMAL, (config.levels, config.dim), jnp.float32)
         tokens = [
             level.reshape(len(level), -1, config.dim) + by_camera + by_level[None, i : i + 1]
             for i, level in enumerate(features)

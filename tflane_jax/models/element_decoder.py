@@ -123,7 +123,7 @@ class ElementDecoder(nn.Module):
         tokens = jnp.concatenate([feature.reshape(-1, feature.shape[-1]) for feature in features])
         tokens = jnp.where(valid[:, None], tokens, 0.0)
 
-        level = self.param("level", nn.initializers.normal(1.0), (config.levels, config.dim))
+        level = self.param("level", nn.initializers.normal(1.0), (config.levels, config.dim), jnp.float32)
         position = jnp.concatenate(
             [
                 image_sine_encoding(mask, config.dim // 2, offset=-0.5).reshape(-1, config.dim) + level[i][None]
@@ -140,7 +140,7 @@ class ElementDecoder(nn.Module):
     def _decode(self, memory, shapes, valid, ratios, size, deterministic: bool) -> ElementOutput:
         """Run the decoder; boxes are (cx, cy, w, h), fractions of the image size."""
         config = self.config
-        embedding = self.param("queries", nn.initializers.normal(1.0), (config.queries, 2 * config.dim))
+        embedding = self.param("queries", nn.initializers.normal(1.0), (config.queries, 2 * config.dim), jnp.float32)
         position, queries = jnp.split(embedding, 2, -1)
         # A point in the first layer, a box from the second on.
         reference = nn.sigmoid(nn.Dense(2, kernel_init=nn.initializers.xavier_uniform(), name="reference")(position))
@@ -222,7 +222,7 @@ class ElementBox(nn.Module):
     def __call__(self, queries: Float[Array, "e c"], reference: Float[Array, "e d"]) -> Float[Array, "e 4"]:
         """Return (cx, cy, w, h) in [0, 1]."""
         x = nn.relu(Mlp((self.dim, self.dim), name="hidden")(queries))
-        small = jnp.array([0.0, 0.0, -2.0, -2.0]) if self.first else jnp.zeros(4)
+        small = jnp.array([0.0, 0.0, -2.0, -2.0] if self.first else [0.0] * 4, jnp.float32)
         change = nn.Dense(4, kernel_init=nn.initializers.zeros, bias_init=lambda *_: small, name="out")(x)
         known = inverse_sigmoid(reference)
         return nn.sigmoid(change + jnp.pad(known, ((0, 0), (0, 4 - known.shape[-1]))))

@@ -243,7 +243,7 @@ class MetaPathConvolution(nn.Module):
         offered = [config.offers_similarity(hop) for hop in range(config.hops)]
         structural = len(config.relations)
         shape = (config.hops, config.channels, structural + any(offered))
-        weights = self.param("selection", nn.initializers.normal(0.01), shape)
+        weights = self.param("selection", nn.initializers.normal(0.01), shape, jnp.float32)
         if any(offered):
             weights = jnp.where(_choices(offered, structural), weights, -jnp.inf)
         mask, width = key_mask(valid.reshape(-1)), config.heads * config.head_dim

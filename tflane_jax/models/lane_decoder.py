@@ -147,7 +147,7 @@ class PointwiseRefinement(nn.Module):
         x = nn.Dense(config.dim, name="here")(here)
         x = x + nn.Dense(config.dim, use_bias=False, name="heading")(heading)
         x = x + nn.Dense(config.dim, use_bias=False, name="lane")(queries)[:, None]
-        x = x + self.param("place", nn.initializers.normal(0.1), (1, config.points, config.dim))
+        x = x + self.param("place", nn.initializers.normal(0.1), (1, config.points, config.dim), jnp.float32)
         x = nn.relu(nn.Dense(config.dim, name="hidden")(nn.relu(x)))
         # 0.3: Adam's steps have one size for all parameters, but points move by metres and lanes by tens of metres.
         return 0.3 * nn.Dense(3, kernel_init=nn.initializers.zeros, name="change")(x)

@@ -72,7 +72,7 @@ class NoisedQueries(nn.Module):
         if config.refine == "fixed":
             middle = config.points // 2
             reference = jnp.broadcast_to(reference[:, :, middle : middle + 1], reference.shape)
-        content = self.param("content", nn.initializers.normal(1.0), (config.dim,))
+        content = self.param("content", nn.initializers.normal(1.0), (config.dim,), jnp.float32)
         return jnp.broadcast_to(content, position.shape), position, lax.stop_gradient(reference)
 
 

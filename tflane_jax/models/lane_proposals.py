@@ -67,7 +67,9 @@ class LaneProposals(nn.Module):
         bias = nn.initializers.constant(-np.log(99.0))
         heat = nn.Dense(proposals.headings, bias_init=bias, name="heat")(x)
         table, centers = x.reshape(h * w, -1), jnp.asarray(self._centers(h, w))
-        embedding = self.param("heading", nn.initializers.normal(0.1), (proposals.headings, proposals.hidden))
+        embedding = self.param(
+            "heading", nn.initializers.normal(0.1), (proposals.headings, proposals.hidden), jnp.float32
+        )
         shape = Mlp((proposals.hidden, proposals.hidden, config.points * 3), name="shape")
 
         def propose(cell: Int[Array, " k"], heading: Int[Array, " k"]):

@@ -117,11 +117,13 @@ class LaneQueries(nn.Module):
         "fixed": one point per lane, a linear function of the position; "iterative": learned anchor lanes.
         """
         config = self.config
-        embedding = self.param("embedding", nn.initializers.normal(1.0), (config.learned_queries, 2 * config.dim))
+        embedding = self.param(
+            "embedding", nn.initializers.normal(1.0), (config.learned_queries, 2 * config.dim), jnp.float32
+        )
         position, content = jnp.split(embedding, 2, -1)
         if config.refine == "iterative":
             start = spread_lanes(config.learned_queries, config.points, self.range)
-            anchors = self.param("anchors", lambda _: inverse_sigmoid(jnp.asarray(start)))
+            anchors = self.param("anchors", lambda _: inverse_sigmoid(jnp.asarray(start, jnp.float32)))
             return content, position, nn.sigmoid(anchors)
         spot = nn.sigmoid(nn.Dense(3, kernel_init=nn.initializers.xavier_uniform(), name="reference")(position))
         shape = (config.learned_queries, config.points, 3)

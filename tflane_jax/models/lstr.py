@@ -178,7 +178,7 @@ class Lstr(nn.Module):
         memory = memory.reshape(-1, config.dim)
         position, mask = position.reshape(-1, config.dim), key_mask(cells.reshape(-1))
 
-        query = self.param("queries", nn.initializers.normal(1.0), (config.queries, config.dim))
+        query = self.param("queries", nn.initializers.normal(1.0), (config.queries, config.dim), jnp.float32)
         x, outputs = jnp.zeros_like(query), []
         norm = nn.LayerNorm(epsilon=1e-5, name="decoder_norm")
         for i in range(config.decoder_layers):

@@ -115,12 +115,12 @@ class LineQueries(nn.Module):
     def __call__(self) -> PointQueries:
         """Return content, position and initial points."""
         config, normal, count = self.config, nn.initializers.normal(1.0), self.config.queries + self.more
-        lines = self.param("instances", normal, (count, 2 * config.dim))
-        points = self.param("points", normal, (config.points, 2 * config.dim))
+        lines = self.param("instances", normal, (count, 2 * config.dim), jnp.float32)
+        points = self.param("points", normal, (config.points, 2 * config.dim), jnp.float32)
         position, content = jnp.split(lines[:, None] + points[None], 2, -1)
         if config.anchors == "spread":
             start = spread_lanes(count, config.points, self.range)[..., : config.coordinates]
-            anchors = self.param("anchors", lambda _: inverse_sigmoid(jnp.asarray(start)))
+            anchors = self.param("anchors", lambda _: inverse_sigmoid(jnp.asarray(start, jnp.float32)))
             return PointQueries(content, position, nn.sigmoid(anchors))
         place = nn.Dense(config.coordinates, kernel_init=nn.initializers.xavier_uniform(), name="reference")
         return PointQueries(content, position, nn.sigmoid(place(position)))
@@ -148,7 +148,7 @@ class NoisedLines(nn.Module):
         # Away from 0 and 1, where the sigmoid of the points is flat.
         border = 0.0 if config.output == "metric" else 0.01
         reference = jnp.clip(self.range.normalise(noised[..., : config.coordinates]), border, 1.0 - border)
-        learned = self.param("points", nn.initializers.normal(1.0), (config.points, 2 * config.dim))
+        learned = self.param("points", nn.initializers.normal(1.0), (config.points, 2 * config.dim), jnp.float32)
         learned = jnp.broadcast_to(learned, (*reference.shape[:2], *learned.shape))
         position, content = jnp.split(learned, 2, -1)
         return PointQueries(content, position, lax.stop_gradient(reference))

@@ -237,7 +237,7 @@ class TemporalEncoder(nn.Module):
         x = nn.Dense(width, name="frame")(self._encode_places(tokens.position, tokens.heading))
         category = nn.Embed(len(RoadUser), width, name="category")(tokens.category)
         size = nn.Dense(width, use_bias=False, name="size")(tokens.size)
-        age = self.param("age", nn.initializers.normal(0.02), (frames, width))
+        age = self.param("age", nn.initializers.normal(0.02), (frames, width), jnp.float32)
         return x + (category + size)[:, None] + jnp.broadcast_to(age, (instances, frames, width))
 
 

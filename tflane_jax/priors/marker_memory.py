@@ -140,7 +140,8 @@ def remember(
     kept = memory.valid & has_previous
     points = memory.points
     if config.compensation == "ego_motion":
-        points = _to_present(points, jnp.where(has_previous, previous_from_ego, jnp.eye(4)))
+        own = jnp.asarray(previous_from_ego, points.dtype)  # the bank keeps its dtype, also in 64-bit mode
+        points = _to_present(points, jnp.where(has_previous, own, jnp.eye(4, dtype=points.dtype)))
     bank = MarkerMemory(
         points=_push(observed.points, jnp.where(kept[..., None, None], points, 0.0)),
         confidence=_push(observed.confidence, jnp.where(kept, memory.confidence, 0.0)),
@@ -148,7 +149,7 @@ def remember(
         valid=_push(observed.valid, kept),
     )
     age = jnp.arange(config.frames)
-    decayed = bank.confidence * (config.decay**age)[:, None]  # c-hat of III-C
+    decayed = bank.confidence * (config.decay**age).astype(bank.confidence.dtype)[:, None]  # c-hat of III-C
     alone = guidance(observed, config.exponent)
     retrieve = jnp.asarray(reads_bank(observed, config))
     strongest = decayed.max(initial=0.0)

@@ -14,7 +14,14 @@ from tflane_jax.geometry import PerceptionRange
 from tflane_jax.plots import style
 from tflane_jax.plots.bev import GROUND, VIEW, Layer, draw_found, draw_scene, truth_layers
 from tflane_jax.plots.figure import new_figure, save_figure
-from tflane_jax.plots.gallery import boundary_entries, label_edges, panel_size, pick, prediction_entries
+from tflane_jax.plots.gallery import (
+    boundary_entries,
+    label_edges,
+    panel_size,
+    pick,
+    prediction_entries,
+    visibility_entries,
+)
 from tflane_jax.plots.map_lines import class_entries
 from tflane_jax.plots.segments import LanePrediction, truth_lines
 from tflane_jax.scene import BevChannel, Example, RoadUser
@@ -140,16 +147,12 @@ def _add_legend(figure: Figure, caption: str, meaning: str, *, drawn: Collection
 
     edge = {"edgecolor": style.OUTLINE, "lw": 1.3}
     car = style.ROAD_USER[RoadUser.CAR]
-    sight = [
-        Line2D([], [], color=style.LANE_CLEAR, lw=2, label="lane in line of sight"),
-        Line2D([], [], color=style.LANE_HIDDEN, lw=2, label="lane out of sight"),
-    ]
     entries: list = [  # column by column
         Patch(facecolor="none", label=meaning, **edge),
         Line2D([], [], color="#b0b3ba", lw=1, label="truth, in predictions"),
         Patch(facecolor=style.OUTLINE + "4d", label="this model finds it", **edge),
         Patch(facecolor="none", ls="--", label="this model misses it", **edge),
-        *(class_entries() if "map_lines" in drawn else [*prediction_entries(), *sight]),
+        *(class_entries() if "map_lines" in drawn else [*prediction_entries(), *visibility_entries()]),
         Patch(facecolor="#0f1116", edgecolor=style.HATCH, hatch="////", lw=0, label="ground out of sight"),
         Patch(facecolor=car + "8c", edgecolor=car, label="road user, its track"),
         Patch(facecolor="none", edgecolor=car, label="not seen at present"),

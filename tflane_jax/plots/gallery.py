@@ -152,7 +152,7 @@ def add_legend(
     from matplotlib.patches import Patch
 
     entries: list = [
-        *(class_entries() if "map_lines" in drawn else _visibility_entries()),
+        *(class_entries() if "map_lines" in drawn else visibility_entries()),
         Patch(facecolor="#0f1116", edgecolor=style.HATCH, hatch="////", lw=0, label="ground out of sight"),
         *(Patch(facecolor=colour, label=user.name.lower()) for user, colour in style.ROAD_USER.items()),
         Patch(facecolor="none", edgecolor=style.OTHER_ELEMENT, label="road user not seen"),
@@ -180,7 +180,8 @@ def add_legend(
     figure.legend(handles=entries, loc="outside lower center", ncols=columns, fontsize=7, frameon=False)
 
 
-def _visibility_entries() -> list:
+def visibility_entries() -> list:
+    """Return the entries of a legend for true lanes by what the sensor can see of them."""
     from matplotlib.lines import Line2D
 
     return [

@@ -6,9 +6,6 @@ images (`marker_*`), at the papers' sizes (`paper_sizes`) and on a GPU (`gpu.ste
 
 from __future__ import annotations
 
-import argparse
-from pathlib import Path
-
 from benchmarks import (
     attention_masks,
     camera_world,
@@ -20,9 +17,9 @@ from benchmarks import (
     masking_variants,
     metrics,
 )
+from benchmarks.timing import command_line
 
-parser = argparse.ArgumentParser(description=__doc__)
-parser.add_argument("--out", type=Path, default=Path("runs/bench"), help="folder for JSON and tables")
+parser = command_line(__doc__)
 options = parser.parse_args()
 for benchmark in (host, attention_masks, masking_variants, metrics, lstr, deformable, markers, camera_world, loading):
     print(f"\n== {benchmark.__name__}\n", flush=True)

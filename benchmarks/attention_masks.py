@@ -17,7 +17,6 @@ the projections leave them (batch, tokens, heads, channels). All results are che
 
 from __future__ import annotations
 
-import argparse
 import importlib
 from collections.abc import Callable
 from pathlib import Path
@@ -29,7 +28,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from benchmarks.timing import Compiled, compile_jax, cores, interleave, machine, markdown_table, save, summarise
+from benchmarks.timing import (
+    Compiled,
+    command_line,
+    compile_jax,
+    cores,
+    interleave,
+    machine,
+    markdown_table,
+    save,
+    summarise,
+)
 from tflane_jax.layers.attention import masked_attention
 from tflane_jax.layers.masks import SpatialMask
 
@@ -325,11 +334,9 @@ def _torch() -> dict[str, Any] | str:
 
 def main() -> None:
     """Parse the command line and run."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, required=True, help="folder for the JSON and the table")
+    parser = command_line(__doc__, seconds=5.0)
     parser.add_argument("--lanes", type=int, nargs="+", default=LANES, help="numbers of lane tokens")
     parser.add_argument("--results", nargs="+", default=RESULTS, choices=RESULTS, help="what to compute")
-    parser.add_argument("--seconds", type=float, default=5.0, help="least time per comparison")
     options = parser.parse_args()
     run(options.out, lanes=tuple(options.lanes), results=tuple(options.results), seconds=options.seconds)
 

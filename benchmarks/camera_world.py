@@ -8,14 +8,13 @@ scene are drawn once for all its key frames, so a frame costs its images and a f
 
 from __future__ import annotations
 
-import argparse
 import time
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from benchmarks.timing import machine, markdown_table, save
+from benchmarks.timing import command_line, machine, markdown_table, save
 from tflane_jax.world.cameras.ring import ARGOVERSE2_RING, NUSCENES_RING, CameraRigConfig
 from tflane_jax.world.cameras.sensor import render_cameras
 from tflane_jax.world.simulate import WorldConfig, simulate
@@ -94,8 +93,7 @@ def _seconds(log: Any, keyframe: int, config: CameraRigConfig) -> float:
 
 def main() -> None:
     """Parse the command line and run."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, default=Path("runs/bench"))
+    parser = command_line(__doc__)
     parser.add_argument("--first", type=int, default=0, help="number of the first scene")
     options = parser.parse_args()
     run(options.out, options.first)

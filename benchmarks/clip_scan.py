@@ -8,7 +8,6 @@ Compile times are CPU seconds of this process, tracing apart. Inputs are invente
 
 from __future__ import annotations
 
-import argparse
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +17,7 @@ import jax
 import numpy as np
 
 from benchmarks.gpu.steps import invented
-from benchmarks.timing import machine, markdown_table, save
+from benchmarks.timing import command_line, machine, markdown_table, save
 from tflane_jax.config import load_config
 from tflane_jax.scene import shapes_of
 from tflane_jax.summary import shapes_of_params
@@ -75,8 +74,7 @@ def run(out: Path, what: str = "gradient", *, tiny: bool = False) -> list[dict[s
 
 def main() -> None:
     """Parse the command line and run."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, required=True, help="folder for the JSON and the table")
+    parser = command_line(__doc__)
     parser.add_argument("--what", choices=["gradient", "loss"], default="gradient")
     parser.add_argument("--tiny", action="store_true", help="one decoder layer")
     options = parser.parse_args()

@@ -22,12 +22,11 @@ import time
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import jax
 
-from benchmarks.timing import machine, markdown_table, save
+from benchmarks.timing import command_line, machine, markdown_table, save
 from tflane_jax.config import RunConfig, load_config
 from tflane_jax.devices import active, in_parts, training_mesh
 from tflane_jax.plan import GIB, KINDS, make_plan
@@ -204,8 +203,7 @@ def run(options: argparse.Namespace) -> dict[str, Any]:
 
 def main() -> None:
     """Parse the command line and run."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, required=True, help="folder for the JSON and the tables")
+    parser = command_line(__doc__)
     parser.add_argument("--config", default="tf_lane/toponet_tfm:street", help="what is compiled")
     parser.add_argument("--layers", type=int, help="of its decoder")
     parser.add_argument("--examples", type=int, default=1, help="of each device (default 1)")

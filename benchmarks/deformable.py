@@ -9,7 +9,6 @@ rounds.
 
 from __future__ import annotations
 
-import argparse
 import importlib.util
 import os
 from collections.abc import Sequence
@@ -20,7 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks.timing import Compiled, compile_jax, interleave, machine, markdown_table, save, summarise
+from benchmarks.timing import Compiled, command_line, compile_jax, interleave, machine, markdown_table, save, summarise
 from tflane_jax.layers.sampling import deformable_attention
 from tflane_jax.training.runtime import configure_jax
 
@@ -137,8 +136,6 @@ def run(out: Path, seconds: float = 10.0) -> None:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, default=Path("runs/bench"), help="folder for JSON and table")
-    parser.add_argument("--seconds", type=float, default=10.0, help="time for each comparison (default 10)")
+    parser = command_line(__doc__, seconds=10.0)
     options = parser.parse_args()
     run(options.out, options.seconds)

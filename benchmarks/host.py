@@ -21,7 +21,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from benchmarks.timing import Compiled, compile_jax, machine, markdown_table, measure, save
+from benchmarks.timing import Compiled, command_line, compile_jax, machine, markdown_table, measure, save
 from tflane_jax.config import RunConfig, load_config
 from tflane_jax.datasets.loading import TRAINING_PARTS, load_arrays
 from tflane_jax.datasets.procedural import ProceduralDataset
@@ -222,9 +222,7 @@ def run(out: Path, seconds: float = 10.0) -> dict[str, Any]:
 
 def main() -> None:
     """Parse the command line and run."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, default=Path("runs/bench"))
-    parser.add_argument("--seconds", type=float, default=10.0, help="for each comparison")
+    parser = command_line(__doc__, seconds=10.0)
     parser.add_argument("--start", type=Path, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.start is not None:

@@ -19,7 +19,6 @@ time, most of them for compiling the updates.
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import tempfile
@@ -33,7 +32,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from benchmarks.timing import Compiled, Program, interleave, machine, markdown_table, save
+from benchmarks.timing import Compiled, Program, command_line, interleave, machine, markdown_table, save
 from tflane_jax.config import RunConfig, load_config
 from tflane_jax.datasets import sources
 from tflane_jax.datasets.batches import batches, first_example, in_workers
@@ -237,10 +236,8 @@ def run(
 
 def main() -> None:
     """Parse the command line and run."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, default=Path("runs/bench"))
+    parser = command_line(__doc__, seconds=8.0)
     parser.add_argument("--cases", nargs="+", choices=list(CASES), default=list(CASES))
-    parser.add_argument("--seconds", type=float, default=8.0, help="of each case, at least three rounds")
     parser.add_argument("--no-updates", action="store_true", help="loading alone, without compiling updates")
     parser.add_argument("--tiny", action="store_true", help="small images, to show that it starts")
     options = parser.parse_args()

@@ -7,7 +7,6 @@ Three 3 x 3 convolutions of 32 channels on two maps of 32 x 64, gradients added 
 
 from __future__ import annotations
 
-import argparse
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from benchmarks.timing import compile_jax, machine, markdown_table, measure, save
+from benchmarks.timing import command_line, compile_jax, machine, markdown_table, measure, save
 from tflane_jax.training.loop_convolutions import with_fast_convolutions
 
 PARTS = 4
@@ -63,9 +62,7 @@ def run(out: Path, seconds: float = 20.0) -> dict[str, Any]:
 
 def main() -> None:
     """Parse the command line and run."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, required=True, help="folder for the JSON and the table")
-    parser.add_argument("--seconds", type=float, default=20.0, help="of the comparison (default 20)")
+    parser = command_line(__doc__, seconds=20.0)
     options = parser.parse_args()
     run(options.out, options.seconds)
 

@@ -9,7 +9,6 @@ last. For inference both sides have the same random weights and must give the sa
 
 from __future__ import annotations
 
-import argparse
 import importlib.util
 import os
 import time
@@ -22,7 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks.timing import Compiled, compile_jax, interleave, machine, markdown_table, save, summarise
+from benchmarks.timing import Compiled, command_line, compile_jax, interleave, machine, markdown_table, save, summarise
 from tflane_jax.convert.lstr import convert_lstr
 from tflane_jax.layers.resnet import ResNetConfig
 from tflane_jax.models.graph_encoders import GcnEncoderConfig, GtnEncoderConfig, HanEncoderConfig
@@ -184,8 +183,6 @@ def run(out: Path, seconds: float = 20.0) -> None:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--out", type=Path, default=Path("runs/bench"), help="folder for JSON and table")
-    parser.add_argument("--seconds", type=float, default=20.0, help="time for each case (default 20)")
+    parser = command_line(__doc__, seconds=20.0)
     options = parser.parse_args()
     run(options.out, options.seconds)

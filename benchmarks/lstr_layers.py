@@ -10,7 +10,6 @@ same numbers, or the benchmark stops.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -22,7 +21,7 @@ import numpy as np
 from jax import lax
 
 from benchmarks.lstr import TRAINING_BATCH, with_torch
-from benchmarks.timing import Compiled, compile_jax, machine, markdown_table, measure, save
+from benchmarks.timing import Compiled, command_line, compile_jax, machine, markdown_table, measure, save
 from benchmarks.torch_fitting import import_torch
 
 XLA, FIRST, PRODUCTS, IM2COL, TORCH = "XLA", "channels first", "a product for each position", "im2col", "PyTorch"
@@ -176,9 +175,7 @@ def run(out: Path, seconds: float = 2.0, batch: int = TRAINING_BATCH, layers: Se
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--out", type=Path, default=Path("runs/bench"), help="folder for JSON and table")
-    parser.add_argument("--seconds", type=float, default=2.0, help="time for each part of a layer (default 2)")
+    parser = command_line(__doc__, seconds=2.0)
     parser.add_argument("--batch", type=int, default=TRAINING_BATCH, help="images (default 16)")
     options = parser.parse_args()
     run(options.out, options.seconds, options.batch)

@@ -9,7 +9,6 @@ by how much the detection's own lanes enter Eq. (3) in the rows of Table II: the
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import itertools
 from pathlib import Path
@@ -17,7 +16,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from benchmarks.timing import markdown_table
+from benchmarks.timing import command_line, markdown_table
 from tflane_jax.config import load_config
 from tflane_jax.datasets.procedural import ProceduralConfig, ProceduralDataset
 from tflane_jax.geometry import PerceptionRange
@@ -96,8 +95,7 @@ def measure(scenes: int) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]
 
 def main() -> None:
     """Parse the command line, measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scenes", type=int, default=40)
+    parser = command_line(__doc__, out=None, scenes=40)
     off, trust, factors = measure(parser.parse_args().scenes)
     rows = []
     for low, high in itertools.pairwise(_EDGES):

@@ -15,7 +15,6 @@ of no ids. --sample N takes N composites, spread over photographs, distances and
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -38,7 +37,7 @@ from benchmarks.marker_composites import (
     known_ids,
     photographs,
 )
-from benchmarks.timing import machine, markdown_table, save
+from benchmarks.timing import command_line, machine, markdown_table, save
 from tflane_jax.markers.image_search import DetectorConfig, ImageMarkers, find_markers
 from tflane_jax.markers.square_pose import solve_square
 from tflane_jax.scene.marker_patterns import dictionary_of, marker_count
@@ -131,9 +130,7 @@ def _median(errors: np.ndarray) -> str:
 
 def main() -> None:
     """Parse the command line and run."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, default=Path("runs/bench"))
-    parser.add_argument("--repeats", type=int, default=1)
+    parser = command_line(__doc__, rounds=1)
     parser.add_argument("--photographs", type=int, default=16, help="most photographs")
     parser.add_argument("--detectors", nargs="+", choices=DETECTORS, default=list(DETECTORS))
     parser.add_argument("--whole", action="store_true", help="search whole photographs, not parts of them")
@@ -142,7 +139,7 @@ def main() -> None:
     options = parser.parse_args()
     if options.ids is not None and options.ids > marker_count(FAMILY):
         parser.error(f"--ids is at most {marker_count(FAMILY)}, the ids of {FAMILY.name}")
-    selection = Selection(options.repeats, options.sample, "whole" if options.whole else "part", options.ids)
+    selection = Selection(options.rounds, options.sample, "whole" if options.whole else "part", options.ids)
     run(options.out, selection, options.photographs, options.detectors)
 
 

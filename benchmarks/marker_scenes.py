@@ -22,7 +22,6 @@ configuration does.
 
 from __future__ import annotations
 
-import argparse
 import time
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
@@ -35,7 +34,7 @@ import numpy as np
 from tqdm import tqdm
 
 from benchmarks.marker_scene_pictures import Cell, Gap, Sighting, save_confidence, save_gaps, sighting
-from benchmarks.timing import machine, markdown_table, save
+from benchmarks.timing import command_line, machine, markdown_table, save
 from tflane_jax.config import load_config
 from tflane_jax.datasets.marker_cache import search_views
 from tflane_jax.datasets.marker_observations import store_of_log
@@ -317,13 +316,11 @@ def scores_table(scores: Mapping[str, Mapping[str, Mapping[str, float]]], count:
 
 def main() -> None:
     """Parse the command line and run."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = command_line(__doc__, scenes=20)
     which = parser.add_mutually_exclusive_group(required=True)
     which.add_argument("--model", type=Path, help="run folder of a camera model with markers")
     which.add_argument("--tiny", action="store_true", help="random weights, to see that everything runs")
     parser.add_argument("--without", type=Path, help="run folder of a model without markers")
-    parser.add_argument("--scenes", type=int, default=20)
-    parser.add_argument("--out", type=Path, required=True, help="folder for table, picture and JSON")
     options = parser.parse_args()
     configure_jax()
     run(options.out, options.model, options.without, options.scenes)

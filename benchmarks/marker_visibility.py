@@ -13,14 +13,13 @@ has all boards in sight.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Literal
 
 import numpy as np
 
-from benchmarks.timing import markdown_table
+from benchmarks.timing import command_line, markdown_table
 from tflane_jax.config import WorldData, load_config
 from tflane_jax.datasets.marker_observations import markers_of, store_of_log
 from tflane_jax.datasets.procedural import FIRST_SCENE, ProceduralConfig, ProceduralDataset
@@ -109,8 +108,7 @@ def at_once(name: str, scenes: int) -> list[list[str]]:
 
 def main() -> None:
     """Parse the command line, measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scenes", type=int, default=40)
+    parser = command_line(__doc__, out=None, scenes=40)
     parser.add_argument("--at-once", action="store_true", help="count the boards of a frame instead")
     options = parser.parse_args()
     scenes: int = options.scenes

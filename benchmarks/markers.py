@@ -8,14 +8,13 @@ memory the bank is moved, decayed and read in every frame, with or without marke
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from benchmarks.timing import compile_jax, machine, markdown_table, measure, save
+from benchmarks.timing import command_line, compile_jax, machine, markdown_table, measure, save
 from tflane_jax.config import load_config
 from tflane_jax.datasets.loading import TRAINING_PARTS, load_arrays
 from tflane_jax.datasets.procedural import ProceduralConfig, ProceduralDataset
@@ -53,9 +52,7 @@ def run(out: Path, seconds: float = 20.0) -> dict[str, Any]:
 
 def main() -> None:
     """Parse the command line and run."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, default=Path("runs/bench"))
-    parser.add_argument("--seconds", type=float, default=20.0)
+    parser = command_line(__doc__, seconds=20.0)
     options = parser.parse_args()
     run(options.out, options.seconds)
 

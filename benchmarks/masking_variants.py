@@ -10,7 +10,6 @@ variants, where docs/results holds them (`tflane tables tf_lane.masking --record
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks.timing import compile_jax, interleave, machine, markdown_table, save, summarise
+from benchmarks.timing import command_line, compile_jax, interleave, machine, markdown_table, save, summarise
 from tflane_jax.ablations.paper.tf_lane import MASKING
 from tflane_jax.config import load_ablations, load_config
 from tflane_jax.files.fields import load_json
@@ -150,10 +149,8 @@ def run(out: Path, *, queries: tuple[int, ...] = QUERIES, seconds: float = 8.0) 
 
 def main() -> None:
     """Parse the command line and run."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, required=True, help="folder for the JSON and the table")
+    parser = command_line(__doc__, seconds=8.0)
     parser.add_argument("--queries", type=int, nargs="+", default=QUERIES, help="numbers of lane queries")
-    parser.add_argument("--seconds", type=float, default=8.0, help="time for each number of queries")
     options = parser.parse_args()
     run(options.out, queries=tuple(options.queries), seconds=options.seconds)
 

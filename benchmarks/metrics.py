@@ -10,7 +10,6 @@ quoted from docs/reference/metrics.md, section 7 (CPU time, a comparable machine
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -19,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from benchmarks.timing import machine, markdown_table, save
+from benchmarks.timing import command_line, machine, markdown_table, save
 from tflane_jax.metrics import (
     AreaDetections,
     AreaTruth,
@@ -239,10 +238,8 @@ def run(out: Path, frames: int = 100, rounds: int = 5) -> dict[str, Any]:
 
 def main() -> None:
     """Parse the command line and run."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, default=Path("runs/bench"))
+    parser = command_line(__doc__, rounds=5)
     parser.add_argument("--frames", type=int, default=100, help="in each set")
-    parser.add_argument("--rounds", type=int, default=5, help="over each set; the median counts")
     options = parser.parse_args()
     run(options.out, options.frames, options.rounds)
 

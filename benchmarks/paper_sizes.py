@@ -24,7 +24,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from benchmarks.timing import machine, markdown_table, save
+from benchmarks.timing import command_line, machine, markdown_table, save
 from tflane_jax.cli import main as tflane
 from tflane_jax.config import NuScenesData, OpenLaneV2Data, RunConfig, WorldData, apply_overrides, load_config
 from tflane_jax.models.bev_encoder import BevFormerConfig
@@ -150,8 +150,7 @@ def _row(name: str, found: dict[str, Any]) -> list[str]:
 
 def main() -> None:
     """Parse the command line and run."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, required=True, help="folder for the JSON and the table")
+    parser = command_line(__doc__)
     parser.add_argument("--names", nargs="+", default=CONFIGS, help="configurations")
     parser.add_argument("--child", help=argparse.SUPPRESS)
     options = parser.parse_args()

@@ -7,6 +7,7 @@ two times of one round, so that the load of the machine affects both.
 
 from __future__ import annotations
 
+import argparse
 import os
 import platform
 import time
@@ -22,6 +23,7 @@ from tflane_jax.startup import in_another_thread
 from tflane_jax.training.provenance import provenance, thread_setting
 
 Program = Callable[[], Any]
+_OUT = Path("runs/bench")
 
 
 class Compiled(NamedTuple):
@@ -113,6 +115,33 @@ def markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
     rule = f"|{'|'.join('-' * (w + 2) if i == 0 else '-' * (w + 1) + ':' for i, w in enumerate(widths))}|"
     return "\n".join([line(header), rule, *map(line, rows)])
+
+
+def command_line(
+    text: str | None,
+    *,
+    out: Path | None = _OUT,
+    seconds: float | None = None,
+    rounds: int | None = None,
+    scenes: int | None = None,
+) -> argparse.ArgumentParser:
+    """Return the parser of a benchmark, with the options that several have; each adds its own.
+
+    Args:
+        text: help, the docstring of its file.
+        out: default folder of JSON and table; None for a benchmark that prints its result and writes nothing.
+        seconds, rounds, scenes: defaults of these options; None for a benchmark without.
+    """
+    parser = argparse.ArgumentParser(description=text, formatter_class=argparse.RawDescriptionHelpFormatter)
+    if out is not None:
+        parser.add_argument(
+            "--out", metavar="DIR", type=Path, default=out, help=f"folder of the results (default {out})"
+        )
+    counts = (("--seconds", float, seconds, "least time of a comparison"), ("--rounds", int, rounds, "repetitions"))
+    for name, kind, default, what in (*counts, ("--scenes", int, scenes, "number of scenes")):
+        if default is not None:
+            parser.add_argument(name, metavar="N", type=kind, default=default, help=f"{what} (default {default:g})")
+    return parser
 
 
 def save(out: Path, name: str, record: dict[str, Any], table: str) -> None:

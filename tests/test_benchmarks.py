@@ -1,10 +1,12 @@
 """The arithmetic of the benchmarks; no test asserts a time."""
 
+import importlib
 import json
 import math
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import jax
@@ -24,7 +26,7 @@ from benchmarks import (
     paper_sizes,
 )
 from benchmarks.gpu import matching, steps
-from benchmarks.timing import compile_jax, interleave, markdown_table, summarise
+from benchmarks.timing import command_line, compile_jax, interleave, markdown_table, summarise
 from tests.models.cases import CAMERA_TOPONET, make_camera_example
 from tests.models.test_marker_fusion import CONFIG as MARKERS
 from tests.parameters import random_params
@@ -50,6 +52,30 @@ from tflane_jax.training.schedule import make_optimizer
 from tflane_jax.world.cameras.ring import CameraMount, CameraRigConfig
 from tflane_jax.world.roads.markers import PlacementConfig
 from tflane_jax.world.simulate import WorldConfig
+
+
+@pytest.mark.parametrize("name", ["metrics", "marker_occlusion", "paper_sizes", "marker_scenes", "gpu.matching"])
+def test_options_of_the_benchmarks_have_one_name_and_one_default(name, monkeypatch):
+    """Regression: --out was required in some, --rounds of one was --repeats of another."""
+    module, seen = importlib.import_module(f"benchmarks.{name}"), []
+    monkeypatch.setattr(module, "run", lambda *arguments, **others: seen.append(arguments))
+    monkeypatch.setattr(sys, "argv", [name, *(["--tiny"] if name == "marker_scenes" else [])])
+    module.main()
+    monkeypatch.setattr(sys, "argv", [name, *sys.argv[1:], "--out", "elsewhere"])
+    module.main()
+    assert [arguments[0] for arguments in seen] == [Path("runs/bench"), Path("elsewhere")]
+
+
+def test_every_benchmark_takes_its_common_options_from_one_place():
+    shared = ('"--out"', '"--seconds"', '"--rounds"', '"--repeats"', '"--scenes"')
+    for path in sorted((ROOT / "benchmarks").rglob("*.py")):
+        if path.name != "timing.py":
+            text = path.read_text(encoding="utf-8")
+            assert not [f"{path.name}: {option}" for option in shared if f"add_argument({option}" in text]
+            assert "ArgumentParser(" not in text, path.name
+    options = command_line("text", seconds=2.0, rounds=3).parse_args(["--rounds", "4"])
+    assert vars(options) == {"out": Path("runs/bench"), "seconds": 2.0, "rounds": 4}
+    assert vars(command_line(None, out=None, scenes=1).parse_args([])) == {"scenes": 1}
 
 
 def test_ratio_is_taken_round_by_round():

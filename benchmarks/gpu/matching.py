@@ -9,7 +9,6 @@ callback includes moving costs to the host and assignments back.
 
 from __future__ import annotations
 
-import argparse
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,7 +16,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from benchmarks.timing import compile_jax, machine, markdown_table, measure, save
+from benchmarks.timing import command_line, compile_jax, machine, markdown_table, measure, save
 from tflane_jax.matching import match
 
 
@@ -74,9 +73,7 @@ def run(out: Path, *, tiny: bool = False, seconds: float = 5.0) -> dict[str, Any
 
 def main() -> None:
     """Parse the command line and run."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, required=True, help="folder for the JSON and the table")
-    parser.add_argument("--seconds", type=float, default=5.0, help="of every comparison (default 5)")
+    parser = command_line(__doc__, seconds=5.0)
     parser.add_argument("--tiny", action="store_true", help="small problems, for a CPU")
     options = parser.parse_args()
     run(options.out, tiny=options.tiny, seconds=options.seconds)

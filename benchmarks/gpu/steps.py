@@ -12,7 +12,6 @@ sheet's peak.
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Sequence
 from dataclasses import fields, is_dataclass, replace
@@ -22,7 +21,7 @@ from typing import Any, TypeVar
 import jax
 import numpy as np
 
-from benchmarks.timing import machine, markdown_table, save
+from benchmarks.timing import command_line, machine, markdown_table, save
 from tflane_jax.config import RunConfig, load_config
 from tflane_jax.layers.precision import Precision
 from tflane_jax.plan import KINDS
@@ -150,8 +149,7 @@ def _row(name: str, found: dict[str, Any]) -> list[str]:
 
 def main() -> None:
     """Parse the command line and run."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, required=True, help="folder for the JSON and the table")
+    parser = command_line(__doc__)
     parser.add_argument("--models", nargs="+", choices=CONFIGS, default=list(CONFIGS))
     parser.add_argument("--batch", type=int, default=1, help="examples of an update (default 1)")
     parser.add_argument("--precision", choices=["float32", "bfloat16"], default="bfloat16")

@@ -52,7 +52,7 @@ NUMBER = r"[+-]?\d+\.\d+"
 # "7.6 points over the control (+5.9 to +9.3, p = 0.02" and "(+6.1 points over the control, p = 0.003)".
 INTERVAL = re.compile(rf"({NUMBER})([^()\d]*)\(({NUMBER}) to ({NUMBER})(?:[^()]*?, p [=<] (\d\.\d+))?")
 DIFFERENCE = re.compile(rf"\(({NUMBER})\s+points[^()\d]*, p = (\d\.\d+)\)")
-FINDING = re.compile(rf"({NUMBER}) points \((?:95 % ({NUMBER}) to ({NUMBER}), )?(?:p [<]? ?(\d\.\d+), )?")
+FINDING = re.compile(rf"({NUMBER}) points \((?:95 % ({NUMBER}) to ({NUMBER})[,)] ?)?(?:p [<]? ?(\d\.\d+), )?")
 
 
 def summaries():

@@ -11,7 +11,6 @@ from tflane_jax.ablations.paper.cost import core_minutes
 from tflane_jax.ablations.paper.table import Conversion, PaperTable
 from tflane_jax.ablations.published import record
 from tflane_jax.ablations.tables import TABLES, find_table
-from tflane_jax.commands.convert import convert
 from tflane_jax.errors import UserError
 from tflane_jax.plots.tables import format_table
 from tflane_jax.training.runtime import configure_jax
@@ -71,6 +70,8 @@ def run(options: argparse.Namespace) -> int:
 
 def _convert(conversions: Sequence[Conversion]) -> None:
     """Make the runs of published weights that are not there yet."""
+    from tflane_jax.commands.convert import convert
+
     for wanted in conversions:
         if not (Path(wanted.out) / "config.json").exists():
             convert(wanted.config, Path(wanted.out), Path(wanted.weights), wanted.edge_weight)

@@ -1,4 +1,4 @@
-"""ResNet and its norm against PyTorch's numbers, in training and in inference."""
+"""ResNet with its norms against PyTorch's numbers, in training and in inference."""
 
 from functools import partial
 
@@ -11,7 +11,7 @@ import pytest
 from tests.golden import case_id, golden_modules, implemented, load_module_case, options
 from tests.golden_compare import compare
 from tflane_jax.convert.lstr import backbone_variables
-from tflane_jax.layers.batch_norm import BATCH_AXIS, BatchNorm
+from tflane_jax.layers.batch_norm import BATCH_AXIS
 from tflane_jax.layers.resnet import ResNet, ResNetConfig, StemConvolution, max_pool
 
 BLOCKS = {
@@ -61,51 +61,6 @@ def check(case):
         for key in place:
             expected = expected[key.key]
         np.testing.assert_allclose(value, expected, rtol=2e-5, atol=2e-5, err_msg=str(place))
-
-
-def one_norm(x, *, train, **options):
-    norm = BatchNorm(**options)
-    variables = norm.init(jax.random.key(0), x[0], train=train)
-    apply = lambda one: norm.apply(variables, one, train=train, mutable=["batch_stats"])  # noqa: E731
-    return jax.vmap(apply, axis_name=BATCH_AXIS, out_axes=(0, None))(x)
-
-
-def test_batch_statistics_are_those_of_the_stacked_batch():
-    x = np.random.default_rng(0).normal(2.0, 3.0, (4, 5, 6, 2)).astype(np.float32)
-    out, state = one_norm(jnp.asarray(x), train=True)
-    mean, variance = x.mean((0, 1, 2)), x.var((0, 1, 2))
-    np.testing.assert_allclose(out, (x - mean) / np.sqrt(variance + 1e-5), rtol=1e-4, atol=1e-5)
-    count = x.size // 2
-    np.testing.assert_allclose(state["batch_stats"]["mean"], 0.1 * mean, rtol=1e-5)
-    np.testing.assert_allclose(state["batch_stats"]["var"], 0.9 + 0.1 * variance * count / (count - 1), rtol=1e-5)
-
-
-@pytest.mark.parametrize("options", [{"train": False}, {"train": True, "frozen": True}])
-def test_running_statistics_stay_without_training(options):
-    x = jnp.asarray(np.random.default_rng(0).normal(size=(3, 4, 2)).astype(np.float32))
-    out, state = one_norm(x, **options)
-    np.testing.assert_allclose(out, x / np.sqrt(1 + 1e-5), rtol=1e-6)
-    np.testing.assert_array_equal(state["batch_stats"]["mean"], np.zeros(2))
-    np.testing.assert_array_equal(state["batch_stats"]["var"], np.ones(2))
-
-
-def test_a_frozen_norm_has_nothing_to_learn():
-    variables = BatchNorm(frozen=True).init(jax.random.key(0), jnp.zeros((1, 3)), train=True)
-    assert "params" not in variables
-    assert set(variables["batch_stats"]) == {"mean", "var", "scale", "bias"}
-
-
-def test_one_value_does_not_divide_by_zero():
-    out, state = one_norm(jnp.full((1, 1, 2), 7.0), train=True)
-    np.testing.assert_array_equal(out, np.zeros((1, 1, 2)))
-    np.testing.assert_allclose(state["batch_stats"]["var"], [0.9, 0.9])
-
-
-def test_works_for_one_example_without_a_batch():
-    norm, x = BatchNorm(), jnp.asarray(np.random.default_rng(1).normal(size=(6, 2)).astype(np.float32))
-    variables = norm.init(jax.random.key(0), x, train=True)
-    out, _ = norm.apply(variables, x, train=True, mutable=["batch_stats"])
-    np.testing.assert_allclose(out.mean(0), [0, 0], atol=1e-6)
 
 
 @pytest.mark.parametrize("size", [(6, 8), (7, 9), (6, 9), (2, 2), (1, 1)])

@@ -61,6 +61,20 @@ def test_pixels_outside_the_image_change_nothing(variables):
     jax.tree.map(np.testing.assert_array_equal, run(both), run(both.replace(image=other)))
 
 
+def test_an_absent_camera_is_none_at_all_in_training(variables):
+    """Norms of the batch: features of two views beside a third that delivers nothing are those of the two."""
+
+    def run(cameras):
+        return ImageEncoder(SMALL).apply(variables, cameras, train=True, mutable=["batch_stats"])
+
+    three = views(((32, 32), (24, 20), (32, 32)), (True, True, False))
+    two = jax.tree.map(lambda leaf: leaf[:2], three)
+    (levels, statistics), (alone, expected) = jax.jit(lambda: (run(three), run(two)))()
+    for level, wanted in zip(levels, alone, strict=True):
+        np.testing.assert_allclose(level[:2], wanted, rtol=1e-4, atol=1e-5)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-6), statistics, expected)
+
+
 def gradient(variables, config):
     def loss(params):
         encoder = ImageEncoder(config)

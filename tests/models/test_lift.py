@@ -202,6 +202,21 @@ def test_cameras_may_change_places_and_a_missing_one_may_hold_anything():
     assert np.abs(one - bev).max() > 1e-3
 
 
+def test_an_absent_camera_is_none_at_all_in_training():
+    """Norms of the batch: BEV features of one camera beside one that delivers nothing are those of the one."""
+    views, features = make_views(), jax.random.normal(jax.random.key(0), (2, 4, 6, 8))
+    views, model = views.replace(valid=np.array([True, False])), LiftEncoder(CONFIG)
+    variables = jax.jit(lambda: model.init(jax.random.key(0), [features], views, train=False))()
+
+    def run(features, views):
+        return model.apply(variables, [features], views, train=True, mutable=["batch_stats"])
+
+    one = jax.tree.map(lambda leaf: leaf[:1], views)
+    (bev, statistics), (alone, expected) = jax.jit(lambda: (run(features, views), run(features[:1], one)))()
+    np.testing.assert_allclose(bev, alone, rtol=1e-4, atol=1e-5)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-6), statistics, expected)
+
+
 def test_a_prior_without_data_changes_no_bit_of_the_features():
     views, features = make_views(), jax.random.normal(jax.random.key(0), (2, 4, 6, 8))
     model, noise = LiftEncoder(CONFIG), jax.random.normal(jax.random.key(1), (32, CHANNELS))

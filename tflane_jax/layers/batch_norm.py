@@ -5,7 +5,7 @@ from __future__ import annotations
 import flax.linen as nn
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 STATISTICS = "batch_stats"
 BATCH_AXIS = "batch"
@@ -31,8 +31,17 @@ class BatchNorm(nn.Module):
     epsilon: float = 1e-5
 
     @nn.compact
-    def __call__(self, x: Float[Array, "*b c"], *, train: bool) -> Float[Array, "*b c"]:
-        """Return the normalised features; `train` takes the batch's own statistics and updates the running ones."""
+    def __call__(
+        self, x: Float[Array, "*b c"], *, train: bool, valid: Bool[Array, " v"] | None = None
+    ) -> Float[Array, "*b c"]:
+        """Return the normalised features.
+
+        Args:
+            x: features; the padding must be finite.
+            train: use the batch's own statistics, and update the running ones.
+            valid: which entries of the first axis count in the statistics (of a stack of views, those whose camera
+                exists). If none does in the whole batch, the running statistics stay.
+        """
         channels = x.shape[-1]
         mean = self.variable(STATISTICS, "mean", jnp.zeros, channels, jnp.float32)
         variance = self.variable(STATISTICS, "var", jnp.ones, channels, jnp.float32)
@@ -44,23 +53,32 @@ class BatchNorm(nn.Module):
             bias = self.param("bias", nn.initializers.zeros, (channels,), jnp.float32)
         used_mean, used_variance = mean.value, variance.value
         if train and not self.frozen:
-            used_mean, used_variance, count = self._batch_statistics(x)
+            used_mean, used_variance, count = self._batch_statistics(x, valid)
             if not self.is_initializing() and self.is_mutable_collection(STATISTICS):
                 unbiased = used_variance * (count / jnp.maximum(count - 1.0, 1.0))
-                mean.value += self.momentum * (used_mean - mean.value)
-                variance.value += self.momentum * (unbiased - variance.value)
+                momentum = self.momentum if valid is None else jnp.where(count > 0, self.momentum, 0.0)
+                mean.value += momentum * (used_mean - mean.value)
+                variance.value += momentum * (unbiased - variance.value)
         factor = scale * lax.rsqrt(used_variance + self.epsilon)
         # Computed in float32; the result has the precision of the input.
         return (x * _like(factor, x) + _like(bias - used_mean * factor, x)).astype(x.dtype)
 
-    def _batch_statistics(self, x):
+    def _batch_statistics(self, x, valid):
         """Return mean, biased variance and number of values per channel, over the batch axis where there is one."""
         x = x.astype(jnp.float32)
         axes = tuple(range(x.ndim - 1))
-        average = self._over_batch
-        count = average(jnp.float32(x.size // x.shape[-1]), lax.psum)
-        mean = average(x.mean(axes), lax.pmean)
-        variance = average(jnp.square(x - _like(mean, x)).mean(axes), lax.pmean)
+        positions = jnp.float32(x.size // x.shape[-1])
+        if valid is None:
+            count = self._over_batch(positions, lax.psum)
+            mean = self._over_batch(x.mean(axes), lax.pmean)
+            variance = self._over_batch(jnp.square(x - _like(mean, x)).mean(axes), lax.pmean)
+            return mean, variance, count
+        # Examples differ in the number of views, so sums are added, not means averaged.
+        counted = valid.reshape((-1,) + (1,) * (x.ndim - 1))
+        count = self._over_batch(valid.sum(dtype=jnp.float32) * (positions / len(valid)), lax.psum)
+        total = jnp.maximum(count, 1.0)
+        mean = self._over_batch(x.sum(axes, where=counted), lax.psum) / total
+        variance = self._over_batch(jnp.square(x - _like(mean, x)).sum(axes, where=counted), lax.psum) / total
         return mean, variance, count
 
     def _over_batch(self, value, reduce):

@@ -5,6 +5,7 @@ A bottleneck's stride is on its 3x3 convolution, as in torchvision. Names are to
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Any, Literal
@@ -13,7 +14,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from tflane_jax.layers.batch_norm import BatchNorm
 from tflane_jax.layers.pointwise import convolve
@@ -73,26 +74,34 @@ class ResNet(nn.Module):
     dtype: Any = None
 
     @nn.compact
-    def __call__(self, images: Float[Array, "v h w c"], *, train: bool) -> list[Float[Array, "v hs ws cs"]]:
-        """Return the feature maps of the stages, finest first; the stem alone reduces height and width by 4."""
+    def __call__(
+        self, images: Float[Array, "v h w c"], *, train: bool, valid: Bool[Array, " v"] | None = None
+    ) -> list[Float[Array, "v hs ws cs"]]:
+        """Return the feature maps of the stages, finest first; the stem alone reduces height and width by 4.
+
+        Args:
+            images: stack of views, finite.
+            train: norms use batch statistics, unless they are frozen.
+            valid: which views count in these statistics; None for all.
+        """
         config = self.config
         x = StemConvolution(config.stem_channels, self.dtype, name="conv1")(images)
-        x = nn.relu(BatchNorm(config.frozen_stem_norm or config.frozen_norms, name="bn1")(x, train=train))
+        x = nn.relu(BatchNorm(config.frozen_stem_norm or config.frozen_norms, name="bn1")(x, train=train, valid=valid))
         x = max_pool(x)
         x = lax.stop_gradient(x) if self.frozen_stages > 0 else x
         block = BasicBlock if config.block == "basic" else Bottleneck
 
-        def run_stage(self, x, stage):
+        def run_stage(self, x, valid, stage):
             for i in range(config.blocks[stage]):
                 stride, name = config.strides[stage] if i == 0 else 1, f"layer{stage + 1}_{i}"
                 part = block(config.channels[stage], stride, config.frozen_norms, self.dtype, name=name)
-                x = part(x, train=train)
+                x = part(x, train=train, valid=valid)
             return x
 
         outputs = []
         for stage in range(len(config.blocks)):
             run = partial(run_stage, stage=stage)
-            x = nn.remat(run)(self, x) if self.remat else run(self, x)
+            x = nn.remat(run)(self, x, valid) if self.remat else run(self, x, valid)
             x = lax.stop_gradient(x) if self.frozen_stages > stage + 1 else x
             outputs.append(x)
         return outputs
@@ -159,13 +168,16 @@ class BasicBlock(nn.Module):
     kernel_init: nn.initializers.Initializer = _INIT
 
     @nn.compact
-    def __call__(self, x: Float[Array, "v h w c"], *, train: bool) -> Float[Array, "v ho wo co"]:
-        """Return the block's features."""
+    def __call__(
+        self, x: Float[Array, "v h w c"], *, train: bool, valid: Bool[Array, " v"] | None = None
+    ) -> Float[Array, "v ho wo co"]:
+        """Return the block's features; `valid` as in `ResNet`."""
+        norm = partial(BatchNorm, self.frozen)
         y = _conv(self.channels, 3, self.stride, "conv1", self.dtype, self.kernel_init)(x)
-        y = nn.relu(BatchNorm(self.frozen, name="bn1")(y, train=train))
+        y = nn.relu(norm(name="bn1")(y, train=train, valid=valid))
         y = _conv(self.channels, 3, 1, "conv2", self.dtype, self.kernel_init)(y)
-        y = BatchNorm(self.frozen, name="bn2")(y, train=train)
-        return nn.relu(y + _shortcut(x, self.channels, self.stride, self.frozen, train, self.dtype))
+        y = norm(name="bn2")(y, train=train, valid=valid)
+        return nn.relu(y + _shortcut(x, self.channels, self.stride, norm, train, valid, self.dtype))
 
 
 class Bottleneck(nn.Module):
@@ -177,21 +189,34 @@ class Bottleneck(nn.Module):
     dtype: Any = None
 
     @nn.compact
-    def __call__(self, x: Float[Array, "v h w c"], *, train: bool) -> Float[Array, "v ho wo co"]:
-        """Return the block's features."""
-        y = nn.relu(BatchNorm(self.frozen, name="bn1")(_conv(self.channels, 1, 1, "conv1", self.dtype)(x), train=train))
+    def __call__(
+        self, x: Float[Array, "v h w c"], *, train: bool, valid: Bool[Array, " v"] | None = None
+    ) -> Float[Array, "v ho wo co"]:
+        """Return the block's features; `valid` as in `ResNet`."""
+        norm = partial(BatchNorm, self.frozen)
+        y = _conv(self.channels, 1, 1, "conv1", self.dtype)(x)
+        y = nn.relu(norm(name="bn1")(y, train=train, valid=valid))
         y = _conv(self.channels, 3, self.stride, "conv2", self.dtype)(y)
-        y = nn.relu(BatchNorm(self.frozen, name="bn2")(y, train=train))
-        y = BatchNorm(self.frozen, name="bn3")(_conv(4 * self.channels, 1, 1, "conv3", self.dtype)(y), train=train)
-        return nn.relu(y + _shortcut(x, 4 * self.channels, self.stride, self.frozen, train, self.dtype))
+        y = nn.relu(norm(name="bn2")(y, train=train, valid=valid))
+        y = _conv(4 * self.channels, 1, 1, "conv3", self.dtype)(y)
+        y = norm(name="bn3")(y, train=train, valid=valid)
+        return nn.relu(y + _shortcut(x, 4 * self.channels, self.stride, norm, train, valid, self.dtype))
 
 
-def _shortcut(x: jax.Array, channels: int, stride: int, frozen: bool, train: bool, dtype: Any) -> jax.Array:
+def _shortcut(
+    x: jax.Array,
+    channels: int,
+    stride: int,
+    norm: Callable[..., BatchNorm],
+    train: bool,
+    valid: jax.Array | None,
+    dtype: Any,
+) -> jax.Array:
     """Return x, projected where the block changes its shape (inside the calling module's compact method)."""
     if stride == 1 and x.shape[-1] == channels:
         return x
     projected = _conv(channels, 1, stride, "downsample_conv", dtype)(x)
-    return BatchNorm(frozen, name="downsample_bn")(projected, train=train)
+    return norm(name="downsample_bn")(projected, train=train, valid=valid)
 
 
 def _conv(

@@ -64,14 +64,14 @@ class ImageEncoder(nn.Module):
     def __call__(self, cameras: CameraViews, *, train: bool = False) -> list[Float[Array, "v h w c"]]:
         """Return the levels (V, h, w, C), finest first.
 
-        With `train`, norms use batch statistics, unless they are frozen.
+        With `train`, norms use the statistics of the batch's valid views, unless they are frozen.
         """
         config = self.config
         dtype = jnp.bfloat16 if config.precision == "bfloat16" else None
         shown = image_valid(cameras)
         images = normalise(cameras.image, shown).astype(dtype or jnp.float32)
         backbone = ResNet(config.backbone, config.frozen_stages, config.remat, dtype, name="backbone")
-        features = backbone(images, train=train)
+        features = backbone(images, train=train, valid=cameras.valid)
         pyramid = FeaturePyramid(config.pyramid, dtype, name="pyramid")
         return [level.astype(jnp.float32) for level in pyramid([features[i] for i in config.stages])]
 

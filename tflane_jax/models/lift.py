@@ -16,7 +16,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import BevGrid, PerceptionRange, invert_pose
@@ -92,6 +92,7 @@ class LiftEncoder(nn.Module):
         features: Float[Array, "v h w c"],
         cameras: Float[Array, "v p"],
         points: Float[Array, "v d h w 3"],
+        valid: Bool[Array, " v"] | None = None,
         *,
         train: bool,
         fuse: BevHook | None = None,
@@ -102,12 +103,13 @@ class LiftEncoder(nn.Module):
             features: of V cameras; finite.
             cameras: parameters of the cameras, see `camera_vector`.
             points: of the rays, metres, ego frame (`ray_points`); NaN for those of a camera that does not exist.
+            valid: which cameras count in the batch statistics; None for all.
             train: norms use batch statistics, and dropout is on.
             fuse: how priors change the BEV features, once; positions are a sine encoding of (x, y).
         """
         config, grid = self.config, self.config.grid
         network = partial(DepthNet, config.dim, config.bins, config.pyramid, config.dropout, name="depth_net")
-        logits, context = run_layer(self, network, config, features, cameras, train=train)
+        logits, context = run_layer(self, network, config, features, cameras, valid, train=train)
         rows, columns = grid.rows * config.fine, grid.columns * config.fine
         cells = cell_numbers(points, BevGrid(grid.range, rows, columns), config.border)
         x = collect(context, jax.nn.softmax(logits, -1), cells, rows * columns).reshape(rows, columns, config.dim)
@@ -156,7 +158,8 @@ class LiftEncoder(nn.Module):
     ) -> tuple[Float[Array, "y x c"], Float[Array, "v h w d"]]:
         """Return what `encode` does, from calibrated cameras."""
         size, shape = cameras.image.shape[1:3], (features.shape[1], features.shape[2])
-        valid = jnp.asarray(cameras.valid)[:, None, None]
+        there = jnp.asarray(cameras.valid)
+        valid = there[:, None, None]
         # A missing camera's calibration may be anything; it must reach neither the points nor the norms.
         eye = jnp.eye(4, dtype=jnp.float32)[None]
         pose = jnp.where(valid, cameras.camera_from_ego, eye)
@@ -174,7 +177,7 @@ class LiftEncoder(nn.Module):
         scale = self.config.image_scale
         affine = jnp.broadcast_to(jnp.array([[[scale, 0.0, 0.0], [0.0, scale, 0.0]]]), (len(intrinsics), 2, 3))
         vector = camera_vector(intrinsics[:, :2] / scale, affine, pose)
-        return self.encode(features, vector, points, train=train, fuse=fuse)
+        return self.encode(features, vector, points, there, train=train, fuse=fuse)
 
 
 def _convolved(train: bool, encoder: LiftEncoder, x: Float[Array, "y x c"]) -> Float[Array, "y x c"]:

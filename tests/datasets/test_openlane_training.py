@@ -1,5 +1,7 @@
 """A world exported as OpenLane-V2 gives clips with virtual markers and the SD map, and trains with both and memory."""
 
+import json
+import shutil
 from dataclasses import replace
 
 import jax
@@ -114,6 +116,30 @@ def test_a_model_learns_from_markers_and_the_sd_map_with_memory(data):
         assert max(np.abs(leaf).max() for leaf in jax.tree.leaves(gradient[name])) > 0
     found = [answer.centerlines.points for _, answer in predictions(TASK, params, frames, FRAMES)]
     assert np.isfinite(found).all()
+
+
+def test_a_run_trains_resumes_and_is_measured_on_the_folder(data, tmp_path):
+    """Clips from disk, with markers, SD map and memory: the same bits with and without a stop, and scores by stream."""
+    training = TrainingConfig(steps=4, batch_size=2, eval_every=2, checkpoint_every=2)
+    config = RunConfig(task=TASK, data=data, optim=OptimConfig(warmup_steps=0), training=training)
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    train_run(config, whole, progress=False)
+    shutil.copytree(whole, killed)
+    shutil.rmtree(killed / "checkpoints/step_00000004")
+    train_run(config, killed, start="resume", progress=False)
+    [params], [resumed] = (open_run(folder, "last").params for folder in (whole, killed))
+    jax.tree.map(np.testing.assert_array_equal, params, resumed)
+    before = open_run(whole, 2).params[0]
+    for name in ("marker_tokens", "sd_map_tokens", "encoder"):
+        assert not all(map(np.array_equal, jax.tree.leaves(params[name]), jax.tree.leaves(before[name])))
+
+    assert main(["eval", str(whole), "--split", "val", "--out", str(tmp_path / "scores")]) == 0
+    rows = {row["lanes of"]: row for row in json.loads((tmp_path / "scores.json").read_text())["rows"]}
+    assert rows["all"]["frames"] == SCENES * FRAMES
+    assert sum(rows[group]["frames"] for group in ("seen", "gap", "before")) == SCENES * FRAMES
+    assert rows["seen"]["frames"] >= FRAMES
+    assert 0.0 < rows["all"]["OLS"] < 1.0
+    assert "DET_l" not in rows["occluded"]  # its files say nothing of occlusion
 
 
 def test_a_missing_sd_map_is_named(data):

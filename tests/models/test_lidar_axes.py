@@ -12,6 +12,7 @@ from tests.models.cases import CAMERA, LINES, SMALL_LINES, make_camera_example, 
 from tests.parameters import random_params
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import BevGrid, PerceptionRange, invert_pose, project, transform_points, yaw_pose
+from tflane_jax.losses.map_masks import bev_line_mask
 from tflane_jax.models.bevformer import can_bus_vector
 from tflane_jax.models.lane_denoising import DenoisingConfig
 from tflane_jax.models.lidar_axes import (
@@ -25,7 +26,7 @@ from tflane_jax.models.lidar_axes import (
 from tflane_jax.models.lift import LiftConfig
 from tflane_jax.models.maptr import MapTrConfig
 from tflane_jax.models.maptrv2 import MapTrV2Config
-from tflane_jax.scene import SdMap, VehicleState
+from tflane_jax.scene import MapLines, SdMap, VehicleState
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 
 RANGE = PerceptionRange((-30.0, 26.0), (-14.0, 16.0), (-2.0, 2.0))
@@ -117,6 +118,25 @@ def test_the_road_users_ahead_come_first_in_either_axes():
     # A prior that takes x for forward prefers those to the right.
     blind = turned.priors.build(replace(turned.spec, forward="x"))["traffic_flow"]
     assert blind.observe(in_lidar_axes(example), None)[0].index.tolist() != here.index.tolist()
+
+
+@pytest.mark.parametrize("vehicle", [True, False])
+def test_the_truth_of_the_bev_mask_lies_where_the_mask_does(vehicle):
+    """The mask of lines in the lidar's frame, its cells turned into the ego axes, as the mask head's are."""
+    example = make_example(vehicle=vehicle)
+    points = np.random.default_rng(1).uniform([-20, -10, -1], [20, 10, 1], (3, 4, 3)).astype(np.float32)
+    lines = MapLines.empty(4, 4)
+    lines.points[:3], lines.valid[:3], lines.points[3] = points, True, np.nan
+    lines = jax.tree.map(jnp.asarray, lines)
+    ego, lidar = BevGrid(RANGE, 60, 112), range_in_lidar_axes(RANGE)
+    there = lines.replace(points=transform_points(invert_pose(level_pose(example)), lines.points.reshape(-1, 3)))
+    there = there.replace(points=there.points.reshape(lines.points.shape))
+    expected = raster_in_ego_axes(bev_line_mask(there, (ego.columns, ego.rows), lidar))
+    host = with_cameras(lidar, MapTrV2Config, range=RANGE, axes="lidar")
+    found = bev_line_mask(host.lines_over_bev(lines, example), (ego.rows, ego.columns), host.bev_range)
+    assert np.asarray(found != expected).mean() < 0.002  # cells whose edge a line touches
+    assert 0.02 < np.asarray(found).mean() < 0.3
+    assert np.asarray(found != bev_line_mask(lines, (ego.rows, ego.columns), RANGE)).mean() > (0.02 if vehicle else -1)
 
 
 def with_cameras(range_, kind=MapTrConfig, **settings):

@@ -50,11 +50,13 @@ class MapTrV2LossConfig(MapTrLossConfig):
             terms = one_to_many_losses(output, targets, range_, self)
             return {f"many_{key}": self.many_weight * value for key, value in terms.items()}
         if name == "line_mask":
-            masks = jax.vmap(partial(bev_line_mask, shape=output.shape[-2:], range_=range_))(lines)
+            over = jax.vmap(host.lines_over_bev)(lines, batch)
+            masks = jax.vmap(partial(bev_line_mask, shape=output.shape[-2:], range_=range_))(over)
             return {"mask": self.mask_weight * mask_loss(output, masks, self.mask_positive)[None]}
         if name == "view_line_masks":
             masks = jax.vmap(partial(view_line_masks, shape=output.shape[-2:]))(lines, views)
-            return {"view_mask": self.view_mask_weight * mask_loss(output, masks, self.view_mask_positive)[None]}
+            there = views.valid[..., None, None]
+            return {"view_mask": self.view_mask_weight * mask_loss(output, masks, self.view_mask_positive, there)[None]}
         if name == "depth":
             low, high, step = host.encoder.bev.depth
             each = partial(depth_targets, shape=output.shape[2:4], low=low, high=high, step=step)
@@ -85,11 +87,22 @@ def one_to_many_losses(
     return line_losses(prediction, assignment, repeated, range_, config)
 
 
-def mask_loss(logits: Float[Array, "*b"], mask: Bool[Array, "*b"], positive: float) -> Float[Array, ""]:
-    """Return the mean cross-entropy over cells, those of the mask weighted by `positive`."""
+def mask_loss(
+    logits: Float[Array, "*b"], mask: Bool[Array, "*b"], positive: float, valid: Bool[Array, "*c"] | None = None
+) -> Float[Array, ""]:
+    """Return the mean cross-entropy over cells, those of the mask weighted by `positive`.
+
+    With `valid`, which broadcasts against the cells, it is the mean over the valid ones; 0 without any.
+    """
     true = mask.astype(logits.dtype)
+    if valid is not None:
+        valid = jnp.broadcast_to(valid, logits.shape)
+        logits = jnp.where(valid, logits, 0.0)
     weight = jnp.where(true > 0, positive, 1.0)
-    return (weight * optax.losses.sigmoid_binary_cross_entropy(logits, true)).mean()
+    every = weight * optax.losses.sigmoid_binary_cross_entropy(logits, true)
+    if valid is None:
+        return every.mean()
+    return jnp.where(valid, every, 0.0).sum() / jnp.maximum(valid.sum(), 1)
 
 
 def depth_loss(logits: Float[Array, "*b d"], bins: Int[Array, "*b"], valid: Bool[Array, "*b"]) -> Float[Array, ""]:

@@ -92,12 +92,12 @@ class HostConfig:
 
     @property
     def example_points(self) -> dict[str, int]:
-        """Settings of `ExampleConfig`, dots in their names, that the truth of this host's loss must have."""
+        """Required numbers of points: from the dotted name of a setting of `ExampleConfig` to the number."""
         return {}
 
     @property
     def example_forms(self) -> dict[str, tuple[str, str]]:
-        """Settings of `ExampleConfig`, dots in their names, without which the truth is another: value, reason."""
+        """Required forms of the truth: from the dotted name of a setting of `ExampleConfig` to (value, reason)."""
         return {}
 
     @property
@@ -110,8 +110,8 @@ class HostConfig:
         """The properties of the host that priors depend on."""
         return HostSpec(self.query_dim, self.range, self.encoder.bev_range, self.query_type)
 
-    def seen(self, example: Example) -> Example:
-        """Return an example as encoder and priors take it: in another frame, if the host works in one."""
+    def in_host_frame(self, example: Example) -> Example:
+        """Return the example in the host's own frame, for the encoder."""
         return example
 
     def build(self) -> Host:
@@ -189,7 +189,7 @@ class Host(nn.Module):
         """
         tokens = encode(self.priors.by_name, observations, deterministic=not train)
         hook = bev_hook(self.priors.by_name, tokens, self.config.spec)
-        encoded = encode_example(self.encoder, self.config.seen(example), memory, train=train, hook=hook)
+        encoded = encode_example(self.encoder, self.config.in_host_frame(example), memory, train=train, hook=hook)
         elements = None
         if self.config.elements is not None and encoded.front is not None:
             elements = self.elements(*encoded.front, deterministic=not train)

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 
 from tflane_jax.geometry import PerceptionRange, invert_pose, pose_yaw, transform_points, yaw_pose
 from tflane_jax.models.prior import BevCells, HostQueries, Prior
-from tflane_jax.scene import CameraViews, Example, SdMap, TrafficFlow, VehicleState
+from tflane_jax.scene import CameraViews, Example, MapLines, SdMap, TrafficFlow, VehicleState
 
 
 def range_in_lidar_axes(range_: PerceptionRange) -> PerceptionRange:
@@ -65,6 +65,19 @@ def in_lidar_axes(example: Example) -> Example:
             sd_map=None if example.sd_map is None else _sd_map(example.sd_map, lidar),
             previous_from_ego=lidar @ jnp.asarray(example.previous_from_ego) @ level,
         )
+
+
+def lines_beside_lidar(lines: MapLines, example: Example) -> MapLines:
+    """Return map lines in the frame that `raster_in_ego_axes` gives a raster: ego axes with the lidar's place, heading.
+
+    Args:
+        lines: of the example's frame; padding may hold anything.
+        example: knows the lidar's pose.
+    """
+    turn = yaw_pose(*jnp.array([0.0, 0.0, -math.pi / 2]))
+    with jax.default_matmul_precision("highest"):
+        pose = turn @ invert_pose(level_pose(example))
+    return replace(lines, points=lines_in_ego_axes(jnp.asarray(lines.points), pose))
 
 
 def lines_in_ego_axes(points: Float[Array, "*b p d"], level: Float[Array, "4 4"]) -> Float[Array, "*b p d"]:

@@ -32,6 +32,7 @@ from tflane_jax.models.lidar_axes import (
     InLidarAxes,
     in_lidar_axes,
     level_pose,
+    lines_beside_lidar,
     lines_in_ego_axes,
     range_in_ego_axes,
     range_in_lidar_axes,
@@ -107,9 +108,13 @@ class MapTrConfig(HostConfig):
         spec = super().spec
         return spec if self.axes == "ego" else replace(spec, range=range_in_lidar_axes(self.range), forward="y")
 
-    def seen(self, example: Example) -> Example:
+    def in_host_frame(self, example: Example) -> Example:
         """Return an example in the host's own axes."""
         return example if self.axes == "ego" else in_lidar_axes(example)
+
+    def lines_over_bev(self, lines: MapLines, example: Example) -> MapLines:
+        """Return map lines of the example's frame in that of the raster of line masks, whose range is `bev_range`."""
+        return lines if self.axes == "ego" else lines_beside_lidar(lines, example)
 
     def build_priors(self) -> dict[str, Prior]:
         """Return the priors of this host, by name; they observe examples in the host's own axes."""

@@ -51,7 +51,7 @@ def check_fit(model: HostConfig, example: Example) -> None:
     _check_elements(model, example)
     encoder, cameras = model.encoder, example.cameras
     if isinstance(encoder, CameraEncoderConfig) and isinstance(encoder.bev, BevFormerConfig) and cameras is not None:
-        seen = model.seen(example).cameras
+        seen = model.in_host_frame(example).cameras
         assert seen is not None
         check_capacity(encoder.bev, seen)
 

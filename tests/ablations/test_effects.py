@@ -1,15 +1,25 @@
 """Effects of a declared comparison: differences, intervals and findings, on results made by hand."""
 
-import json
 import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from tflane_jax.ablations.declaration import Claim, Declaration, Declared
+from tests.ablations.effect_cases import (
+    CONTROL,
+    DECLARED,
+    DIFFERENCE,
+    NEGATIVE,
+    PRIMARY,
+    SCENES,
+    SEEDS,
+    made_results,
+    measured,
+)
+from tflane_jax.ablations.declaration import Claim, Declaration
 from tflane_jax.ablations.effects import SAMPLES, Untested, effects, judged_claims, untested
-from tflane_jax.ablations.findings import findings, save_effects, sentence
+from tflane_jax.ablations.findings import findings, sentence
 from tflane_jax.ablations.recorded import Measured
 from tflane_jax.ablations.results import Results
 from tflane_jax.ablations.statistics import holm, paired_difference
@@ -17,38 +27,10 @@ from tflane_jax.errors import UserError
 from tflane_jax.evaluation.by_scene import scene_weights
 from tflane_jax.evaluation.results import SceneRatio, SceneSamples
 
-SCENES, SEEDS = 40, (0, 1, 2, 3)
-PRIMARY, CONTROL = "hidden+traffic/recall", "hidden-traffic/recall"
-NEGATIVE, DIFFERENCE = f"negative control {CONTROL}", "difference of the two"
-DECLARED = Declaration(PRIMARY, (Claim("+TFM"),), CONTROL)
-LANES = {name: np.random.default_rng([7, i]).integers(0, 20, SCENES) for i, name in enumerate((PRIMARY, CONTROL))}
-
-
-def measured(seed, **ways):
-    """Return a measurement whose recall is about that given for each way: (primary, control)."""
-    scores, ratios = {}, {}
-    for way, recalls in ways.items():
-        rng = np.random.default_rng([seed, *(round(1000 * recall) for recall in recalls)])
-        way = "" if way == "own" else way
-        scores[way], ratios[way] = {}, {}
-        for name, recall in zip((PRIMARY, CONTROL), recalls, strict=True):
-            found, lanes = rng.binomial(LANES[name], recall), LANES[name]
-            ratios[way][name] = SceneRatio(tuple(found.tolist()), tuple(lanes.tolist()))
-            scores[way][name] = found.sum() / lanes.sum()
-        scores[way]["all/AP_l"] = 0.5 + 0.01 * rng.random()
-    return Measured(4, "a protocol", scores, ratios)
-
 
 @pytest.fixture(scope="module")
 def results():
-    """The treatment finds more lanes with traffic, and as many without; taking the traffic away undoes it."""
-    found = Results(("baseline", "+TFM", "matched"), SEEDS, {})
-    for which in ("last", "best"):
-        for seed in SEEDS:
-            found.add("", which, "baseline", seed, measured(seed, own=(0.3, 0.3)))
-            found.add("", which, "+TFM", seed, measured(seed, own=(0.6, 0.3), none=(0.2, 0.3)))
-            found.add("", which, "matched", seed, measured(seed, own=(0.31, 0.3), none=(0.9, 0.9)))
-    return found
+    return made_results()
 
 
 def test_differences_and_tests_are_those_of_the_scores(results):
@@ -221,40 +203,6 @@ def test_rows_of_other_scenes_are_refused():
         effects(found, Declaration(PRIMARY, (Claim("+TFM"),)), "", "last")
 
 
-def test_the_report_says_what_was_declared_and_found(results, tmp_path, capsys):
-    declared = Declared(DECLARED, (0, 1, 2, 3, 4), "2026-01-01T00:00:00+00:00", 0)
-    path = save_effects(results, declared, "", judged_claims(results, DECLARED, ""), tmp_path / "effects")
-    text = path.read_text()
-    assert text.strip() in capsys.readouterr().out
-    assert f"Declared before any run (2026-01-01T00:00:00+00:00): primary measure {PRIMARY}" in text
-    assert "**Interim**: 4 of 5 declared seeds (0, 1, 2, 3)." in text
-    line = next(line for line in text.splitlines() if "*matched*" in line)
-    assert line.startswith(f"- **shown**: +TFM is better than *matched* in {PRIMARY}, +")
-    assert f"; not shown in the negative control {CONTROL}, " in line
-    assert "; shown in the difference of the two, +" in line
-    assert line.count("better in 4 of 4 seeds") >= 2
-    assert line.count("95 % ") == line.count("p 0.") == 3
-    rows = json.loads(path.with_suffix(".json").read_text())["rows"]
-    assert {row["checkpoint"] for row in rows} == {"last", "best"}
-    assert [row["model"] for row in rows[:4]] == ["+TFM", "baseline", "+TFM, none", "matched"]
-    assert "finding" not in rows[0]
-    late = Declared(DECLARED, SEEDS, "2026-01-01T00:00:00+00:00", 3)
-    path = save_effects(results, late, "", judged_claims(results, DECLARED, ""), tmp_path / "late")
-    assert "Declared when 3 runs had begun already" in path.read_text()
-    assert "Interim" not in path.read_text()
-
-
-def test_without_shared_seeds_the_report_says_so(tmp_path, capsys):
-    found = Results(("baseline", "+TFM"), (0, 1), {})
-    found.add("", "last", "baseline", 0, measured(0, own=(0.3, 0.3)))
-    found.add("", "last", "+TFM", 1, measured(1, own=(0.3, 0.3)))
-    path = save_effects(found, Declared(DECLARED, (0, 1), "now", 0), "", judged_claims(found, DECLARED, ""), tmp_path)
-    line = "- **not tested** (no seed has both): +TFM is better than *baseline*; the correction"
-    assert line in path.read_text()
-    assert line in capsys.readouterr().out
-    assert "|" not in path.read_text()
-
-
 def test_claims_about_pairs_are_corrected_together(results):
     """Treatment and control may be interventions; a claim that lacks a row has no finding, but was declared."""
     claims = (
@@ -273,17 +221,17 @@ def test_claims_about_pairs_are_corrected_together(results):
     assert sentence(found[:1]).endswith("Claim: it helps")
 
 
-def test_the_page_names_claims_without_a_result(results, tmp_path):
-    """A model that failed does not make the tests of the others easier."""
-    claims = (Claim("+TFM", "baseline", "it helps"), Claim("failed, none", "baseline", "this too"))
-    whole, part = (effects(results, Declaration(PRIMARY, c), "", "last")[0].p_holm for c in (claims, claims[:1]))
-    assert whole == pytest.approx(2 * part)
-    more = replace(results, models=(*results.models, "failed"), failed={"failed": "the disk is full"})
-    declared = Declared(Declaration(PRIMARY, claims), SEEDS, "now", 0)
-    tested = judged_claims(more, declared.declaration, "")
-    text = save_effects(more, declared, "", tested, tmp_path / "effects").read_text().replace("\n", " ")
-    assert "- **not tested** (no run of failed, none was measured (the disk is full)): failed, none is better" in text
-    assert "Claim: this too" in text
+def test_a_row_without_a_best_checkpoint_counts_at_that_checkpoint_too():
+    found = Results(("b", "a", "c"), SEEDS, {})
+    for seed in SEEDS:
+        for which in ("last", "best"):
+            found.add("", which, "b", seed, measured(seed, own=(0.34, 0.3)))
+            found.add("", which, "a", seed, measured(seed, own=(0.3, 0.3)))
+        found.add("", "last", "c", seed, measured(seed, own=(0.3, 0.3)))
+    declared = Declaration(PRIMARY, (Claim("b", "a"), Claim("b", "c")))
+    last, best = (effects(found, declared, "", which) for which in ("last", "best"))
+    assert [(effect.row, effect.p_holm) for effect in best] == [("a", pytest.approx(2 * best[0].p))]
+    assert [effect.p_holm for effect in last] == holm([effect.p for effect in last])
 
 
 def test_a_claim_about_all_rows_names_those_that_failed():
@@ -303,15 +251,6 @@ def test_a_claim_about_all_rows_names_those_that_failed():
     assert one.startswith("**not tested** (one seed): +TFM minus *matched*")
     reason = "no run of gone was measured (loss is not finite)"
     assert last.startswith(f"**not tested** ({reason}): +TFM is better than *gone*")
-
-
-def test_where_every_row_but_one_failed_all_comparisons_are_named(tmp_path):
-    found = Results(("baseline", "+TFM", "matched"), SEEDS, {}, "p", failed={"+TFM": "out of memory"})
-    found.add("", "last", "baseline", 0, measured(0, own=(0.3, 0.3)))
-    said = findings(judged_claims(found, DECLARED, ""))
-    assert said[0].startswith("**not tested** (no run of +TFM was measured (out of memory)): +TFM is better than *bas")
-    assert "(no run of +TFM was measured (out of memory) and no run of matched was measured)" in said[1]
-    assert len(said) == 2
 
 
 def test_a_score_that_is_no_number_is_not_tested_and_counts():

@@ -1,5 +1,6 @@
 """Reservations of runs: one holder at a time, and none that outlives its process."""
 
+import json
 import os
 import subprocess
 import sys
@@ -59,6 +60,31 @@ os.kill(os.getpid(), 9)
     assert reserved(run).exists()
     with Reservations() as other:
         assert other.take(run)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="elsewhere a dead process cannot be told")
+def test_who_finds_a_void_reservation_late_leaves_the_new_one(tmp_path, monkeypatch):
+    """Two processes find a reservation void; the first reserves the run before the second removes what it found."""
+    run, slow, fast = tmp_path / "seed_0", Reservations(), Reservations()
+    reserved(run).write_text(json.dumps(slow._me | {"process": dead_process()}))
+    set_aside = reservations._set_aside
+
+    def later(path, void):
+        monkeypatch.setattr(reservations, "_set_aside", set_aside)
+        assert fast.take(run)
+        set_aside(path, void)
+
+    monkeypatch.setattr(reservations, "_set_aside", later)
+    assert not slow.take(run)
+    assert json.loads(reserved(run).read_text()) == fast._me
+    assert [path.name for path in tmp_path.iterdir()] == [reserved(run).name]
+
+
+def dead_process() -> int:
+    """Return the number of a process that has ended."""
+    process = subprocess.Popen([sys.executable, "-c", ""])
+    process.wait()
+    return process.pid
 
 
 @pytest.mark.parametrize("content", ["another machine", ""])

@@ -79,7 +79,7 @@ def test_missing_tests_do_not_count_in_the_correction():
 def test_resampled_ratios_against_a_loop_over_drawn_scenes():
     rng = np.random.default_rng(0)
     lanes = rng.integers(0, 9, 12)
-    found = np.stack([rng.binomial(lanes, share) for share in (0.3, 0.5, 0.6)])
+    found = np.stack([rng.binomial(lanes, fraction) for fraction in (0.3, 0.5, 0.6)])
     weights = scene_weights(12, 50, seed=3)
     expected = []
     for times in weights:

@@ -19,7 +19,7 @@ from tflane_jax.training.adaptive import AdaptiveConfig, Memory, judge
 from tflane_jax.training.checkpoint import Checkpoints
 from tflane_jax.training.restarts import RestartsConfig
 
-RULE = AdaptiveConfig(threshold=0.1, fraction=0.5, max_extensions=1, grace=0.25, patience=2)
+RULE = AdaptiveConfig(metric="loss", threshold=0.1, fraction=0.5, max_extensions=1, grace=0.25, patience=2)
 
 
 def verdicts(values, *, config=RULE, length=100, every=10, number=0, memory=None, left=1000):
@@ -109,7 +109,7 @@ def test_invalid_settings_are_named(change):
 # ---------------------------------------------------------------------------------------------------------------------
 # Whole runs
 
-ADAPTIVE = AdaptiveConfig(threshold=0.0, fraction=0.6, grace=0.0, patience=1, shrink=0.5)
+ADAPTIVE = AdaptiveConfig(metric="loss", threshold=0.0, fraction=0.6, grace=0.0, patience=1, shrink=0.5)
 CYCLES = RestartsConfig(cycle_steps=8, factor=1.5, floor=0.05, adaptive=ADAPTIVE)
 FREQUENT = dataclasses.replace(CONFIG, eval_every=3, log_every=1, keep_checkpoints=40)
 CYCLIC = dataclasses.replace(OPTIM, restarts=CYCLES)

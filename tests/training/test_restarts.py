@@ -108,7 +108,7 @@ def test_an_extension_keeps_the_rate_and_has_the_configured_length(elapsed, left
     assert longer.start.dtype == longer.length.dtype == np.int32
 
 
-ADAPTIVE = AdaptiveConfig(patience=1, grace=0.0, extend=1.0, shrink=0.5)
+ADAPTIVE = AdaptiveConfig(metric="loss", patience=1, grace=0.0, extend=1.0, shrink=0.5)
 OPTIM = OptimConfig(lr=0.8, warmup_steps=0, restarts=RestartsConfig(8, 2.0, floor=0.25, adaptive=ADAPTIVE))
 PARAMS = as_vectors({"kernel": jnp.ones((1, 2))})
 

@@ -74,7 +74,7 @@ def merged(there: Archive, new: Archive) -> Archive:
 
 
 def _earlier(there: Mapping[str, Any] | None, new: Mapping[str, Any] | None) -> Mapping[str, Any] | None:
-    """Return the first of two declarations of the same, else the new one."""
+    """Return the earlier declaration if both test the same and it covers the new seeds, else the new one."""
     if there is None or new is None:
         return there or new
     same, other = ({k: v for k, v in one.items() if k not in ("time", "git", "begun", "seeds")} for one in (there, new))

@@ -48,6 +48,7 @@ from tflane_jax.tasks import Model
 
 NONE, OTHER = "no traffic flow at inference", "traffic of another log"
 PRIMARY = "all/recall"
+_ONE_TRAINING = "Each model was trained once: p is about other logs, not about other trainings."
 COLUMNS = ("all/recall", "all/DET_l", "all/TOP_ll", "occluded/recall")
 CLAIMS = (
     Claim("generated", "generated on city", "generated roads that are closer to recorded logs help"),
@@ -197,9 +198,10 @@ def _save(
     save_table(out / "logs", each, meta, title=f"{note}{protocol}, percent ({over}){ending}")
     tests = _tests(found, logs, declared)
     paired = f"Paired over {len(logs)} logs, points."
-    title = " ".join(filter(None, [note.strip(), declared.sentence(), interim, paired, FITTED]))
-    save_table(out / "effects", tests, meta, title=title)
-    print("\n" + format_table(tests, title=title))
+    once = "" if len(seeds) > 1 else _ONE_TRAINING
+    title = " ".join(filter(None, [note.strip(), declared.sentence(), interim, paired, once, FITTED]))
+    save_table(out / "effects", tests, meta, title=title, digits=4)
+    print("\n" + format_table(tests, title=title, digits=4))
     return path
 
 

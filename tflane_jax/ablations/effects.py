@@ -135,8 +135,8 @@ def effects(
     """Return the effects in every measure at one checkpoint, claim by claim.
 
     Two rows are compared over the seeds that both have. A comparison that was declared counts in Holm's correction
-    even if it cannot be tested (see `untested`; one seed, or a score that is NaN): leaving it out would make every
-    other test easier to pass.
+    even if it cannot be tested (no seed has both rows at this checkpoint, there is one seed, or a score is NaN):
+    leaving it out would make every other test easier to pass.
 
     Args:
         results: of the comparison.
@@ -146,13 +146,14 @@ def effects(
         errors: scores where lower is better.
     """
     found = []
-    missing = [1.0] * len(untested(results, declaration, test))
+    compared = [(claim, _compared(results, claim, test, which)) for claim in declaration.claims]
+    missing = [1.0 for _, rows in compared for seeds in rows.values() if not seeds]
     for measure in measures(declaration):
         sign = -1.0 if next(iter(measure.scores)) in errors else 1.0
         every = [
             _effect(results, claim, row, seeds, measure, test, which, sign)
-            for claim in declaration.claims
-            for row, seeds in _compared(results, claim, test, which).items()
+            for claim, rows in compared
+            for row, seeds in rows.items()
             if seeds
         ]
         holm_p = holm([*(1.0 if math.isnan(effect.p) else effect.p for effect in every), *missing])

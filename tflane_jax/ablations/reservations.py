@@ -48,8 +48,9 @@ class Reservations:
         if run in self._held:
             return True
         path = _path(run)
+        found = _content(path)
         if self._is_void(path):
-            _set_aside(path)
+            _set_aside(path, found)
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -124,9 +125,22 @@ def _lives(process: Any) -> bool:
     return True
 
 
-def _set_aside(path: Path) -> None:
-    """Remove a void reservation: of several processes that try, one succeeds in renaming the file."""
+def _content(path: Path) -> tuple[bytes, int] | None:
+    """Return what a reservation says and when it was renewed; None if there is none."""
+    with contextlib.suppress(OSError):
+        return path.read_bytes(), path.stat().st_mtime_ns
+    return None
+
+
+def _set_aside(path: Path, void: tuple[bytes, int] | None) -> None:
+    """Remove a reservation that was found void.
+
+    Another process may have removed it since and reserved the run: its file is put back.
+    """
     aside = path.with_name(f".{path.name}.{uuid.uuid4().hex}")
     with contextlib.suppress(OSError):
         os.rename(path, aside)
+        if _content(aside) != void:
+            with contextlib.suppress(FileExistsError):  # a third process has reserved the run meanwhile
+                os.link(aside, path)
         aside.unlink()

@@ -1,9 +1,9 @@
-"""Runs that are recorded (`ablations.archive`) in the place of trainings, and the record of a table's own runs.
+"""Recorded runs (`ablations.archive`) that replace trainings, and the record of a table's own runs.
 
-A recorded run has the place of a training with the same configuration, seed and thread setting. If there is none with
-the thread setting of this process, one with another setting has it, because a table is made from what was trained,
-wherever that was. A run that another table recorded has the place of one that neither this table recorded nor this
-machine trained. Runs of a CPU and of an accelerator do not meet in a table, see `with_recorded`.
+A recorded run replaces a training with the same configuration, seed and thread setting. If none has the thread setting
+of this process, one with another setting does, because a table is made from what was trained, wherever that was. A run
+that another table recorded is used only if this table has no record of it and this machine has not trained it. Runs of
+a CPU and of an accelerator do not meet in a table, see `with_recorded`.
 """
 
 from __future__ import annotations

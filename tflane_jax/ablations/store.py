@@ -97,7 +97,7 @@ def _default(field: dataclasses.Field[Any]) -> Any:
 
 
 def runs_elsewhere(plan: Sequence[Job], store: Path, replan: Callable[[Mapping[str, Any]], Sequence[Job]]) -> list[str]:
-    """Return a line for each other thread setting with which runs began that a plan has not begun.
+    """Return a line for each other thread setting that has runs of this plan which do not exist under its own.
 
     Args:
         plan: every run once.

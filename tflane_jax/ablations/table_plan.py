@@ -83,7 +83,8 @@ def plan_table(
     plans = [_planned(table, rows, hosts, seeds, store, threads) for threads in settings]
     chosen = with_recorded([plan.jobs for plan in plans], archive, table.declaration.scores)
     trained = {name: [replace(job, scored_by=scored_by) for job in of_row] for name, of_row in chosen.items()}
-    # The host of a row that is recorded or complete is needed no more; trained anew, it would make another row of that.
+    # Hosts are trained only for rows that still start from them: retraining the host of a complete row would make it
+    # another run.
     starts = {job.config.training.init_from for of_row in trained.values() for job in of_row if not job.is_complete()}
     needed = {
         name: [job for job in of_host if str(job.folder) in starts] for name, of_host in plans[0].host_jobs.items()

@@ -33,7 +33,8 @@ class AdaptiveConfig:
        `shrink` times as high above the floor as before.
 
     Attributes:
-        metric: name of a score of the evaluation.
+        metric: a score of the evaluation, "group/name". The scores of lane graphs have no loss: choose another one, and
+            `mode` "max".
         mode: whether a lower ("min") or a higher ("max") value is better.
         threshold: least relative improvement that counts, in [0, 1).
         fraction: last part of a cycle, relative to its length, in which it can be extended.
@@ -44,7 +45,7 @@ class AdaptiveConfig:
         shrink: factor on the cycle's height after a stuck cycle, in (0, 1].
     """
 
-    metric: str = "loss"
+    metric: str = "all/loss"
     mode: Literal["min", "max"] = "min"
     threshold: FractionBelowOne = 0.01
     fraction: Fraction = 0.5

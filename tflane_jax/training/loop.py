@@ -314,7 +314,8 @@ def _not_finite(values: dict[str, np.ndarray], step: int, seeds: tuple[int, ...]
     what = ", ".join(f"{name} = {numbers[name]}" for name in terms)
     return (
         f"step {step + 1}, seed {seeds[bad]}: {what} is not finite. The last good state (step {step}) is kept in "
-        f"{kept}. Lower optim.lr or optim.clip_norm and start again, from there with training.init_from"
+        f"{kept}. Lower optim.lr or optim.clip_norm and train into another folder, from the start or from this run's "
+        "averaged parameters (training.init_from)"
     )
 
 

@@ -1,8 +1,8 @@
 """The GTN paper's table, on front views of the built-in world: its encoder beside others in the same model.
 
-`gtn_lane.1` trains from random weights, `gtn_lane.2` fine-tunes the published LSTR. Each encoder has one learning rate,
-from the search that the table declares (`tflane tables NAME --search`), for both of its rows: they differ in the
-schedule alone.
+`gtn_lane.1` trains from random weights, `gtn_lane.2` fine-tunes the published LSTR. Each encoder has one learning rate
+for both of its rows, which differ in the schedule alone. The rates are chosen by hand until the search that the table
+declares (`tflane tables NAME --search`) has been run.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ _COMPOSED = "HAN, meta-paths"
 _ENCODERS = {_TRANSFORMER: "transformer", _GTN: "gtn", _GCN: "gcn", _HAN: "han", _COMPOSED: "han_meta_paths"}
 _EQ_2 = ", Eq. (2)"
 
-# Learning rates by encoder. Those of gtn_lane.1 and gtn_lane.2 are given, not searched for, until --search was run.
+# Learning rates by encoder, chosen by hand.
 _RATES = dict.fromkeys(_ENCODERS, "1e-3")
 _FINE_TUNING_RATES = dict.fromkeys(_ENCODERS, "1e-4")
 

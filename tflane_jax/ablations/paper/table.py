@@ -97,7 +97,7 @@ class PaperTable:
         host_minutes: the same for one of `hosts`.
         note: a sentence of the table's text, such as why a column of the paper is missing.
         steps_factor: how many times as long every run is, see `lengthened`.
-        search: by which the learning rates of the rows were chosen; None where they were not searched for.
+        search: by which the learning rates of the rows are to be chosen; None where they were not searched for.
     """
 
     name: str

@@ -170,10 +170,10 @@ def _board(marker_id: int, damage: str, rng: np.random.Generator) -> tuple[np.nd
 
     angle = rng.uniform(-0.35, 0.35)
     if damage.startswith("bar"):
-        share = float(damage.split()[1]) / 100.0
+        fraction = float(damage.split()[1]) / 100.0
         middle = start + rng.uniform(0.15, 0.85) * side
         across = (x - middle) * np.cos(angle) + (y - 0.5 * whole) * np.sin(angle)
-        cover(np.abs(across) < 0.5 * share * side, rng.uniform(0.15, 0.7))
+        cover(np.abs(across) < 0.5 * fraction * side, rng.uniform(0.15, 0.7))
     elif damage == "corner":
         radius = rng.uniform(0.3, 0.42) * side
         corner = start + side * rng.integers(0, 2, 2)

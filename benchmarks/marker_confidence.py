@@ -104,7 +104,7 @@ def main() -> None:
         entering = [f"{values[inside].mean():.3f}" if inside.any() else "-" for values in factors.values()]
         rows.append([f"{low:g} to {high:g} m", f"{inside.mean():.1%}", mean, *entering])
     print(f"{len(off)} detections, in the middle {np.median(off):.2f} m off\n")
-    print(markdown_table(["off by", "share", "mean confidence", *factors], rows))
+    print(markdown_table(["off by", "fraction", "mean confidence", *factors], rows))
 
 
 if __name__ == "__main__":

@@ -88,8 +88,8 @@ def run(out: Path, selection: Selection, most: int, only: Sequence[str] = DETECT
             rows.append([damage, detector, *(f"{np.isfinite(cell).mean():.2f} ({_median(cell)})" for cell in cells)])
     for detector in only:
         cell = _pooled(errors, detector, DAMAGE, DISTANCES)
-        share, each = f"{np.isfinite(cell).mean():.3f}", f"{seconds[detector] / count:.2f}"
-        totals.append([detector, share, _median(cell), str(false[detector]), each])
+        fraction, each = f"{np.isfinite(cell).mean():.3f}", f"{seconds[detector] / count:.2f}"
+        totals.append([detector, fraction, _median(cell), str(false[detector]), each])
     table = markdown_table(["damage", "detector", *(f"found (error m){name}" for name in groups)], rows)
     summary = markdown_table(["detector", "found", "error m", "false ids", "CPU s an image"], totals)
     what = "whole photographs" if selection.shown == "whole" else "parts of photographs"

@@ -126,8 +126,8 @@ class Clock:
     def __str__(self) -> str:
         first, later = self.frames[0], self.frames[1:] or self.frames
         parts = {name: np.mean([frame.get(name, 0.0) for frame in later]) for name in later[0]}
-        shares = ", ".join(f"{name} {seconds:.1f}" for name, seconds in parts.items())
-        each = f"CPU seconds of a frame: {sum(parts.values()):.1f} ({shares})"
+        each_part = ", ".join(f"{name} {seconds:.1f}" for name, seconds in parts.items())
+        each = f"CPU seconds of a frame: {sum(parts.values()):.1f} ({each_part})"
         return f"{each}; of the first one, which compiles: {sum(first.values()):.0f}"
 
 

@@ -100,9 +100,9 @@ def at_once(name: str, scenes: int) -> list[list[str]]:
     rows = []
     for kind, count, known, gap in zip(("detected", "visible"), boards, lanes, gaps, strict=True):
         some = known[count > 0]
-        shares = [(count == 0).mean(), gap.mean(), (count == 1).mean(), (count == 2).mean(), (count > 2).mean()]
+        fractions = [(count == 0).mean(), gap.mean(), (count == 1).mean(), (count == 2).mean(), (count > 2).mean()]
         cut = [f"{np.median(some):.0f}", f"{(some > prior.prior.lanes).mean():.1%}"] if len(some) else ["-", "-"]
-        rows.append([f"{name}, {kind}", str(len(count)), *(f"{share:.1%}" for share in shares), *cut])
+        rows.append([f"{name}, {kind}", str(len(count)), *(f"{fraction:.1%}" for fraction in fractions), *cut])
     return rows
 
 

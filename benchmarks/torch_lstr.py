@@ -28,7 +28,7 @@ class Batch(NamedTuple):
     Attributes:
         images: (B, 3, H, W) float32 normalised BGR.
         masks: (B, 1, H, W) float32, 1 where there is no image.
-        targets: per image (n, 3 + 2 P) float32 [1, lower, upper, xs, ys] as shares of the image; -1e5 for no point.
+        targets: per image (n, 3 + 2 P) float32 [1, lower, upper, xs, ys] as fractions of the image; -1e5 for no point.
     """
 
     images: np.ndarray

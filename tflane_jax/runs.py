@@ -286,7 +286,7 @@ def evaluate_run(
                     raise
     rows: list[dict[str, Any]] = []
     for group in every[0].groups:
-        values = [one.groups[group] for one in every]
+        values = [one.shown(group) for one in every]
         rows += [{"lanes of": group, "seed": seed, **one} for seed, one in zip(seeds, values, strict=True)]
         if len(seeds) > 1:
             table = {name: np.array([one[name] for one in values]) for name in values[0]}

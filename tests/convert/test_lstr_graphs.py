@@ -18,10 +18,10 @@ def test_the_selected_edge_types_have_the_weight(similarity, weight):
     encoder = dataclasses.replace(GTN, similarity=similarity, hops=3)
     scores = jnp.asarray(selections(encoder, weight))
     offered = jnp.array([[encoder.offers_similarity(hop) or e < 7 for e in range(8)] for hop in range(3)])
-    shares = np.asarray(jax.nn.softmax(jnp.where(offered[:, None], scores, -jnp.inf), -1))
+    fractions = np.asarray(jax.nn.softmax(jnp.where(offered[:, None], scores, -jnp.inf), -1))
     for hop, chosen in ((0, 0), (1, 0), (2, 7)):
-        np.testing.assert_allclose(shares[hop, :, chosen], weight, rtol=1e-6)
-        others = np.delete(shares[hop, 0], chosen)
+        np.testing.assert_allclose(fractions[hop, :, chosen], weight, rtol=1e-6)
+        others = np.delete(fractions[hop, 0], chosen)
         np.testing.assert_allclose(others[others > 0], others.max(), rtol=1e-5)
 
 

@@ -48,10 +48,10 @@ class DriveDataset:
         lanes, segments = LaneGraph.empty(5, 11), LaneGraph.empty(4, 10)
         for graph in (lanes, segments):
             count = graph.points.shape[1]
-            share = np.linspace(0, 1, count)[:, None]
+            fraction = np.linspace(0, 1, count)[:, None]
             for row, number in enumerate(order):
                 start, end = (np.array([*point, 0.3]) for point in CENTRELINES[number])
-                graph.points[row] = transform_points(invert_pose(pose), start + share * (end - start))
+                graph.points[row] = transform_points(invert_pose(pose), start + fraction * (end - start))
                 graph.is_connector[row] = number == 1
             side = np.array([0.0, 1.7, 0.0])
             graph.left[:3], graph.right[:3] = graph.points[:3] + side, graph.points[:3] - side

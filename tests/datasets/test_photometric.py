@@ -122,8 +122,8 @@ def test_a_grid_is_drawn_with_its_probability():
     config = PhotometricConfig(grid_mask=0.7)
     drawn = [draw_grid(config, np.random.default_rng(seed), 50, 50) for seed in range(300)]
     assert 0.62 < np.mean([grid is not None for grid in drawn]) < 0.78
-    shares = [grid.mean() for grid in drawn if grid is not None]
-    assert 0.15 < np.mean(shares) < 0.35  # half of the rows and half of the columns
+    fractions = [grid.mean() for grid in drawn if grid is not None]
+    assert 0.15 < np.mean(fractions) < 0.35  # half of the rows and half of the columns
 
 
 def test_an_example_without_cameras_stays_as_it_is():

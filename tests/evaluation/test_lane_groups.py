@@ -62,7 +62,7 @@ def test_driven_fraction_against_loops(seed):
     flow.category[0], flow.valid[0] = RoadUser.TRUCK, True
     driven, nearest = np.zeros((len(lines), SAMPLES), bool), np.full(len(lines), np.inf)
     seen = flow.valid & ~flow.occluded & (flow.category != RoadUser.PEDESTRIAN)[:, None]
-    share = np.linspace(0.0, 1.0, 1001)
+    fraction = np.linspace(0.0, 1.0, 1001)
     for lane, line in enumerate(lines):
         points = resample(line, SAMPLES)[:, :2]
         forward = np.gradient(points, axis=0)
@@ -71,9 +71,9 @@ def test_driven_fraction_against_loops(seed):
             a, b = flow.position[k, n, :2], flow.position[k, m, :2]
             turn = np.angle(np.exp(1j * (flow.yaw[k, m] - flow.yaw[k, n])))
             for i, point in enumerate(points):
-                distance = np.linalg.norm(a + share[:, None] * (b - a) - point, axis=-1)
+                distance = np.linalg.norm(a + fraction[:, None] * (b - a) - point, axis=-1)
                 nearest[lane] = min(nearest[lane], distance.min())
-                yaw = flow.yaw[k, n] + share[distance.argmin()] * turn
+                yaw = flow.yaw[k, n] + fraction[distance.argmin()] * turn
                 off = np.angle(np.exp(1j * (yaw - np.arctan2(forward[i, 1], forward[i, 0]))))
                 driven[lane, i] |= distance.min() <= BESIDE and abs(off) <= HEADING
     assert driven[0].any()

@@ -23,12 +23,12 @@ def test_matches_the_reference(path):
         np.testing.assert_allclose(pillars.swapaxes(0, 1), outputs["ref_3d"][b], rtol=1e-6)
         eye = np.broadcast_to(np.eye(3, dtype=np.float32), (len(matrix), 3, 3))
         size = np.tile([width, height], (len(matrix), 1))
-        share, inside = project_pillars(grid.range.denormalise(pillars), eye, matrix, size)
+        fraction, inside = project_pillars(grid.range.denormalise(pillars), eye, matrix, size)
         np.testing.assert_array_equal(inside, outputs["bev_mask"][:, b])
         expected = outputs["reference_points_cam"][:, b]
-        np.testing.assert_allclose(share[inside], expected[inside], rtol=2e-5, atol=2e-5)
+        np.testing.assert_allclose(fraction[inside], expected[inside], rtol=2e-5, atol=2e-5)
         # Points behind a camera lie hundreds of images away, where float32 has no more digits.
-        np.testing.assert_allclose(share, expected, rtol=1e-4, atol=2e-5)
+        np.testing.assert_allclose(fraction, expected, rtol=1e-4, atol=2e-5)
 
 
 def test_each_camera_has_its_own_size():
@@ -39,9 +39,9 @@ def test_each_camera_has_its_own_size():
         2, 0
     )
     points = np.array([[[10, 0, 0], [10, 0, 5], [-10, 0, 0]]], np.float32)
-    share, inside = project_pillars(points, intrinsics, camera_from_ego, np.array([[80, 60], [40, 60]]))
-    np.testing.assert_allclose(share[0, 0, :2], [[0.5, 0.5], [0.5, 5 / 60]], rtol=1e-6)
-    np.testing.assert_allclose(share[1, 0, :2], [[1.0, 0.5], [1.0, 5 / 60]], rtol=1e-6)
+    fraction, inside = project_pillars(points, intrinsics, camera_from_ego, np.array([[80, 60], [40, 60]]))
+    np.testing.assert_allclose(fraction[0, 0, :2], [[0.5, 0.5], [0.5, 5 / 60]], rtol=1e-6)
+    np.testing.assert_allclose(fraction[1, 0, :2], [[1.0, 0.5], [1.0, 5 / 60]], rtol=1e-6)
     assert inside.tolist() == [[[True, True, False]], [[False, False, False]]]
 
 
@@ -54,8 +54,8 @@ def test_turning_vehicle_and_cameras_together_turns_the_grid():
     cameras = np.stack([ahead @ yaw_pose(*rng.normal(size=3)) for _ in range(3)])
     intrinsics = np.array([[60, 0, 50], [0, 60, 20], [0, 0, 1.0]])[None].repeat(3, 0)
     size = np.tile([100, 50], (3, 1))
-    share, inside = project_pillars(points, intrinsics, cameras, size)
+    fraction, inside = project_pillars(points, intrinsics, cameras, size)
     turned, also = project_pillars(points, intrinsics, cameras @ yaw_pose(0.0, 0.0, np.pi), size)
     np.testing.assert_array_equal(also[:, ::-1], inside)
     assert 5 < inside.sum() < inside.size / 2
-    np.testing.assert_allclose(turned[:, ::-1][inside], share[inside], atol=1e-6)
+    np.testing.assert_allclose(turned[:, ::-1][inside], fraction[inside], atol=1e-6)

@@ -174,9 +174,9 @@ def check(case):
     compare(case, lambda params, inputs: run(case, params, inputs))
 
 
-def random_graphs(seed, *shape, share=0.4):
+def random_graphs(seed, *shape, fraction=0.4):
     rng = np.random.default_rng(seed)
-    return jnp.asarray((rng.random(shape) * (rng.random(shape) < share)).astype(np.float32))
+    return jnp.asarray((rng.random(shape) * (rng.random(shape) < fraction)).astype(np.float32))
 
 
 def random_weights(seed, count, channels=2, types=3):
@@ -212,7 +212,7 @@ _normalise = jax.jit(normalise, static_argnums=(1, 2))
 @settings(max_examples=20, deadline=None)
 @given(st.integers(0, 10**6), st.sampled_from(["rows", "columns"]), st.sampled_from(["kept", "removed", "lonely"]))
 def test_edges_into_a_node_sum_to_one(seed, receivers, loops):
-    graphs = random_graphs(seed, 2, 4, 4, share=0.3)
+    graphs = random_graphs(seed, 2, 4, 4, fraction=0.3)
     out = np.asarray(_normalise(graphs, receivers, loops))
     seen = np.asarray(graphs) * (1 - np.eye(4) if loops == "removed" else 1)
     axis = 2 if receivers == "rows" else 1
@@ -235,7 +235,7 @@ def test_hop_by_hop_equals_the_product_of_the_selections(hops):
     """With rows that sum to 1, FastGTN's hops are the products of 2022, whose normalisation changes nothing."""
     adjacency = normalise(random_graphs(6, 3, 7, 7), loops="lonely")
     weights, x = random_weights(7, hops), random_graphs(8, 7, 6)
-    hopped = propagate(lambda _, shares, h: jnp.einsum("ed,enm,md->nd", shares, adjacency, h), weights, x)
+    hopped = propagate(lambda _, fractions, h: jnp.einsum("ed,enm,md->nd", fractions, adjacency, h), weights, x)
     graphs = jax.jit(meta_path_graphs)(adjacency, weights[::-1])
     expected = jnp.concatenate([graphs[c] @ x[:, 3 * c : 3 * c + 3] for c in range(2)], 1)
     np.testing.assert_allclose(hopped, expected, rtol=1e-5, atol=1e-6)

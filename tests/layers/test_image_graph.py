@@ -54,29 +54,29 @@ def dense_stack(relations, valid):
 
 
 @jax.jit
-def by_matrices(stack, shares, x):
-    mixed = jnp.einsum("ec,enm,mc->nc", shares, stack, x.reshape(-1, x.shape[-1]))
+def by_matrices(stack, fractions, x):
+    mixed = jnp.einsum("ec,enm,mc->nc", fractions, stack, x.reshape(-1, x.shape[-1]))
     return mixed.reshape(x.shape)
 
 
 @pytest.mark.parametrize("shape", [SHAPE, (1, 1), (1, 5), (4, 1), (0, 3), (2, 0)])
 def test_shifts_and_means_equal_the_matrices(shape):
     valid = random_valid(0, shape)
-    shares, x = random_array(1, len(RELATIONS), 2), random_array(2, *shape, 2)
+    fractions, x = random_array(1, len(RELATIONS), 2), random_array(2, *shape, 2)
     x = jnp.where(valid[..., None], x, 0.0)
-    out = jax.jit(lambda s, x: mix_relations(RELATIONS, s, x, jnp.asarray(valid)))(shares, x)
-    np.testing.assert_allclose(out, by_matrices(dense_stack(RELATIONS, valid), shares, x), rtol=1e-5, atol=1e-6)
+    out = jax.jit(lambda s, x: mix_relations(RELATIONS, s, x, jnp.asarray(valid)))(fractions, x)
+    np.testing.assert_allclose(out, by_matrices(dense_stack(RELATIONS, valid), fractions, x), rtol=1e-5, atol=1e-6)
 
 
 @pytest.mark.parametrize("relations", [RELATIONS, ("self",), ("up", "right"), ("column", "self")])
 def test_gradients_equal_those_of_the_matrices(relations):
     valid = random_valid(3)
-    shares, x = random_array(4, len(relations), 2), random_array(5, *SHAPE, 2)
+    fractions, x = random_array(4, len(relations), 2), random_array(5, *SHAPE, 2)
     weight, stack = random_array(6, *SHAPE, 2), dense_stack(relations, valid)
 
     def gradients(mix):
         scalar = lambda s, x: (weight * mix(s, jnp.where(valid[..., None], x, 0.0))).sum()  # noqa: E731
-        return jax.jit(jax.grad(scalar, argnums=(0, 1)))(shares, x)
+        return jax.jit(jax.grad(scalar, argnums=(0, 1)))(fractions, x)
 
     ours = gradients(lambda s, x: mix_relations(relations, s, x, jnp.asarray(valid)))
     theirs = gradients(lambda s, x: by_matrices(stack, s, x))
@@ -92,18 +92,18 @@ _mix_all = jax.jit(lambda s, x, v: mix_relations(RELATIONS, s, x, v))
 def test_mixtures_keep_a_constant(seed):
     """Rows sum to 1: a constant stays for all mixing weights and any padding."""
     valid = random_valid(seed)
-    shares = jax.nn.softmax(3 * random_array(seed, len(RELATIONS), 2), axis=0)
+    fractions = jax.nn.softmax(3 * random_array(seed, len(RELATIONS), 2), axis=0)
     constant = jnp.where(valid[..., None], jnp.asarray([2.0, -1.0]), 0.0)
-    np.testing.assert_allclose(_mix_all(shares, constant, jnp.asarray(valid)), constant, rtol=1e-5)
+    np.testing.assert_allclose(_mix_all(fractions, constant, jnp.asarray(valid)), constant, rtol=1e-5)
 
 
 def test_flipping_the_map_swaps_up_and_down():
     valid, x = random_valid(7), random_array(8, *SHAPE, 2)
     x = jnp.where(valid[..., None], x, 0.0)
-    shares = random_array(9, 4, 2)
+    fractions = random_array(9, 4, 2)
     mix = jax.jit(mix_relations, static_argnums=0)
-    up = mix(("up", "down", "left", "row"), shares, x, jnp.asarray(valid))
-    down = mix(("down", "up", "left", "row"), shares, x[::-1], jnp.asarray(valid[::-1]))
+    up = mix(("up", "down", "left", "row"), fractions, x, jnp.asarray(valid))
+    down = mix(("down", "up", "left", "row"), fractions, x[::-1], jnp.asarray(valid[::-1]))
     np.testing.assert_allclose(up[::-1], down, rtol=1e-6)
 
 

@@ -58,7 +58,7 @@ def overlap(a, b):
     return np.prod(side) / union - (hull - union) / hull
 
 
-def shares(box, size):
+def fractions(box, size):
     return np.concatenate([box.mean(0) / size, (box[1] - box[0]) / size])
 
 
@@ -80,7 +80,7 @@ def loop_terms(prediction, lanes, elements, layer):
                 logit = logits[q, elements.attribute[b, e]]
                 p, truth = 1 / (1 + np.exp(-logit)), elements.box[b, e]
                 cost[q, j] = -np.log(p) * 0.25 * (1 - p) ** 2 + np.log(1 - p) * 0.75 * p**2
-                cost[q, j] += 2.5 * np.abs(shares(box[q], SIZES[b]) - shares(truth, SIZES[b])).sum()
+                cost[q, j] += 2.5 * np.abs(fractions(box[q], SIZES[b]) - fractions(truth, SIZES[b])).sum()
                 cost[q, j] -= overlap(box[q], truth)
         owner = {q: real[j] for j, q in assign(cost).items()}
         positives += len(owner)
@@ -89,7 +89,7 @@ def loop_terms(prediction, lanes, elements, layer):
                 classes += focal(logits[q, k], q in owner and elements.attribute[b, owner[q]] == k)
             if q in owner:
                 truth = elements.box[b, owner[q]]
-                boxes += np.abs(shares(box[q], SIZES[b]) - shares(truth, SIZES[b])).sum()
+                boxes += np.abs(fractions(box[q], SIZES[b]) - fractions(truth, SIZES[b])).sum()
                 apart += 1 - overlap(box[q], truth)
         one = jax.tree.map(lambda leaf, b=b: leaf[b], (prediction.centerlines, lanes))
         visible = np.flatnonzero(lanes.valid[b])

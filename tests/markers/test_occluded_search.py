@@ -24,11 +24,11 @@ def board(number=21):
     return grey[TOP:BOTTOM, LEFT:RIGHT].copy(), CORNERS - [LEFT, TOP]
 
 
-def bar(grey, corners, share, tone=60):
+def bar(grey, corners, fraction, tone=60):
     """Draw a post before the board."""
     middle, width = corners.mean(0), np.ptp(corners[:, 0])
     x = round(float(middle[0] - 0.12 * width))
-    grey[:, x : x + max(2, round(share * width))] = tone
+    grey[:, x : x + max(2, round(fraction * width))] = tone
 
 
 def leaf(grey, corners):

@@ -59,12 +59,12 @@ CLEAR = replace(NOISY, occlusion="none")
 
 
 @pytest.mark.parametrize(
-    ("distance", "growth", "share"), [(60.0, "linear", 1.0), (15.0, "linear", 0.25), (30.0, "quadratic", 0.25)]
+    ("distance", "growth", "fraction"), [(60.0, "linear", 1.0), (15.0, "linear", 0.25), (30.0, "quadratic", 0.25)]
 )
-def test_errors_grow_with_the_distance(distance, growth, share):
+def test_errors_grow_with_the_distance(distance, growth, fraction):
     found = errors(distance, replace(CLEAR, growth=growth))
-    np.testing.assert_allclose(found[:, [0, 3, 4]].std(0), share * np.array([3.0, 2.0, 2.0]), rtol=0.05)
-    np.testing.assert_allclose(found[:, [0, 3, 4]].mean(0), 0.0, atol=0.2 * share)
+    np.testing.assert_allclose(found[:, [0, 3, 4]].std(0), fraction * np.array([3.0, 2.0, 2.0]), rtol=0.05)
+    np.testing.assert_allclose(found[:, [0, 3, 4]].mean(0), 0.0, atol=0.2 * fraction)
     np.testing.assert_allclose(found[:, 1:3], 0.0, atol=1e-9)  # along the ego axis only
     assert not found[:, 5].any()
     # The three are drawn independently.

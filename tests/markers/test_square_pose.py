@@ -45,14 +45,14 @@ def test_the_prior_decides_where_both_poses_fit():
     assert degrees_between(wrong, truth) > 20.0
     flipped = marker_outline(wrong, 1.0, camera.intrinsics, camera.camera_from_ego)
     ego_from, doubtful = invert_pose(camera.camera_from_ego), 0
-    for share in np.linspace(0.0, 1.0, 81):
-        between = (1.0 - share) * exact + share * flipped
+    for fraction in np.linspace(0.0, 1.0, 81):
+        between = (1.0 - fraction) * exact + fraction * flipped
         by_error = solve_square(between, camera.intrinsics, camera.camera_from_ego, DetectorConfig(ambiguous=1.0))
         by_prior = solve_square(between, camera.intrinsics, camera.camera_from_ego)
         right = [degrees_between(ego_from @ fit.camera_from_marker[0], truth) < 15.0 for fit in (by_error, by_prior)]
         assert by_error.error[0] <= by_error.error[1]
         if by_error.ambiguity <= 0.6:
-            assert right[0] == right[1] == (share < 0.5)
+            assert right[0] == right[1] == (fraction < 0.5)
         else:
             doubtful += not right[0]
             assert right[1]

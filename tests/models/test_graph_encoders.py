@@ -104,8 +104,8 @@ def test_gtn_equals_dense_meta_path_products(similarity):
         offered = np.array([similarity == "every_hop", similarity == "every_hop", True])
         structural = jnp.arange(len(stack)) < len(config.relations)
         selection = jnp.where(structural[None, None] | offered[:, None, None], selection, -jnp.inf)
-    (shares,) = state["intermediates"]["relations"]
-    np.testing.assert_allclose(shares, jax.nn.softmax(selection, -1), rtol=1e-6)
+    (fractions,) = state["intermediates"]["relations"]
+    np.testing.assert_allclose(fractions, jax.nn.softmax(selection, -1), rtol=1e-6)
     # The hop that acts first stands last in the product; normalising changes nothing, since rows sum to 1.
     graphs = meta_path_graphs(stack, selection[::-1], GTN_2022)
     np.testing.assert_allclose(graphs.sum(-1), np.broadcast_to(valid.reshape(1, -1), graphs.shape[:2]), atol=1e-5)
@@ -163,9 +163,9 @@ def test_a_composed_meta_path_is_the_product_of_its_edges(scores):
         params["scores"] = jax.tree.map(jnp.zeros_like, params["scores"])
     out, state = jax.jit(partial(module.apply, mutable="intermediates"))({"params": params}, x, position, valid)
     value = np.asarray(x @ params["value"]["kernel"] + params["value"]["bias"][None, None]).reshape(-1, 2, DIM // 2)
-    shown, (shares,) = np.asarray(valid).reshape(-1), state["intermediates"]["relations"]
+    shown, (fractions,) = np.asarray(valid).reshape(-1), state["intermediates"]["relations"]
     expected = 0.0
-    for share, relation in zip(np.asarray(shares)[0, 0], relations, strict=True):
+    for fraction, relation in zip(np.asarray(fractions)[0, 0], relations, strict=True):
         path = relation.split("+")
         weights = [np.asarray(edge) for edge in state["intermediates"][f"{relation}_probabilities"]]
         dense = [dense_edge(edge, weight, 2) for edge, weight in zip(path, weights, strict=True)]
@@ -175,7 +175,7 @@ def test_a_composed_meta_path_is_the_product_of_its_edges(scores):
         product = dense[1] @ (dense[0] * shown[None, :, None])
         np.testing.assert_allclose(product.sum(-1)[:, shown], 1.0, rtol=1e-5)
         heard = np.einsum("hnm,mhd->nhd", product, value).reshape(-1, DIM)
-        expected = expected + share * np.asarray(jax.nn.elu(heard))
+        expected = expected + fraction * np.asarray(jax.nn.elu(heard))
     np.testing.assert_allclose(np.asarray(out).reshape(-1, DIM)[shown], expected[shown], rtol=1e-4, atol=1e-5)
 
 
@@ -234,10 +234,10 @@ def test_intermediates_are_available(name):
     config, (_, seen, _) = CONFIGS[name], compiled(name)(*scene())
     for i in range(config.layers):
         layer = seen[f"layer_{i}"]["graph"]
-        (shares,) = layer["relations"]
-        np.testing.assert_allclose(shares.sum(-1), np.ones(shares.shape[:2]), rtol=1e-5)
+        (fractions,) = layer["relations"]
+        np.testing.assert_allclose(fractions.sum(-1), np.ones(fractions.shape[:2]), rtol=1e-5)
         if isinstance(config, GtnEncoderConfig):
-            assert shares.shape[:2] == (config.hops, config.channels)
+            assert fractions.shape[:2] == (config.hops, config.channels)
             assert ("probabilities" in layer) == (config.similarity is not None)
         if isinstance(config, HanEncoderConfig):
             assert {f"{relation}_probabilities" for relation in config.relations} <= set(layer)

@@ -105,9 +105,9 @@ def test_wear_stays_on_the_ground_from_frame_to_frame_and_varies_along_the_line(
     np.testing.assert_array_equal(first, later)
     fresh = render(LINE, config=config)[row, :, PAINT].astype(int)
     assert first.sum() < 0.9 * fresh.sum()
-    share = first[20:180] / fresh[20:180]
-    assert np.ptp(share) > 0.3
-    assert np.abs(np.diff(share)).max() < 0.2
+    fraction = first[20:180] / fresh[20:180]
+    assert np.ptp(fraction) > 0.3
+    assert np.abs(np.diff(fraction)).max() < 0.2
     assert not render(LINE, config=config, paint_wear=1.0)[..., PAINT].any()
 
 

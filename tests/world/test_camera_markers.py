@@ -70,7 +70,7 @@ def test_every_cell_lies_where_geometry_projects_it(turn):
 
 @pytest.mark.parametrize("distance", [4.0, 23.0, 90.0, 250.0])
 def test_a_picture_darkens_the_image_by_its_area(distance):
-    """However small: the sum over the image is area times tone, for a board of which a known share is white."""
+    """However small: the sum over the image is area times tone, for a board of which a known fraction is white."""
     picture = marker_cells(FAMILY, 3).astype(float)
     half, focal = 0.5, CAMERA.intrinsics[0, 0]
     eye = np.linalg.inv(CAMERA.camera_from_ego)[:3, 3]
@@ -149,7 +149,7 @@ def test_a_tilted_marker_lies_in_its_box():
 
 def test_leaves_hide_the_right_part():
     place = pose(9.0, 0.0, 2.0)
-    plain, leafy = (drawn(marker_bodies(markers(place), covered=share)) for share in (0.0, 0.5))
+    plain, leafy = (drawn(marker_bodies(markers(place), covered=fraction)) for fraction in (0.0, 0.5))
     columns = np.flatnonzero((plain != leafy).any((0, 2)))
     middle = project(place[None, :3, 3], CAMERA.intrinsics, CAMERA.camera_from_ego)[0][0, 0]
     assert abs(columns.min() - middle) < 2.0
@@ -166,7 +166,7 @@ def test_nothing_to_draw():
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"covered": 1.2}, "share"),
+        ({"covered": 1.2}, "fraction"),
         ({"size": 0.0}, "size"),
         ({"ids": [100]}, "0 to 99"),
         ({"ids": [-1]}, "0 to 99"),

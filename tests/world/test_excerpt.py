@@ -98,13 +98,13 @@ def test_a_longer_drive_is_seen_inside_junctions_more_often():
     usual, longer = (
         [simulate(scene, world, HISTORY) for scene in range(5)] for world in (replace(LONGER, longer_s=0.0), LONGER)
     )
-    shares = []
+    fractions = []
     for logs in (usual, longer):
         places = [(log.map.segments, np.stack([k.global_from_ego[:2, 3] for k in log.keyframes])) for log in logs]
-        shares.append(np.mean([on_connector(*place).mean() for place in places]))
+        fractions.append(np.mean([on_connector(*place).mean() for place in places]))
         assert {len(log.timestamps_ns) for log in logs} == {LONGER.frames}
         assert {log.keyframes[0].track_frame for log in logs} == {HISTORY}
-    assert shares[1] > shares[0] + 0.1
+    assert fractions[1] > fractions[0] + 0.1
 
 
 @pytest.mark.parametrize("scene", [1, 9, 33])

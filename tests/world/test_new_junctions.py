@@ -106,7 +106,7 @@ def test_five_legs_lead_everywhere():
 
 
 def test_no_left_turn_holds_for_all_arms_on_the_left():
-    free, banned = (networks(SceneKind.FIVE_LEGS, 4, turn_restriction=share, one_way=0.0) for share in (0.0, 1.0))
+    free, banned = (networks(SceneKind.FIVE_LEGS, 4, turn_restriction=fraction, one_way=0.0) for fraction in (0.0, 1.0))
     for net in banned:
         for arm, ends in exits(net).items():
             assert all(math.remainder(end - arm, 360.0) < 50.0 for end in ends)

@@ -42,8 +42,8 @@ def distance_to(points, line):
     """Return how far points (k, 2) are from a polyline (n, 2), by brute force over its segments."""
     a, b = line[:-1, None], line[1:, None]
     along = b - a
-    share = ((points[None] - a) * along).sum(-1) / np.maximum((along**2).sum(-1), 1e-12)
-    return np.linalg.norm(points[None] - a - np.clip(share, 0, 1)[..., None] * along, axis=-1).min(0)
+    fraction = ((points[None] - a) * along).sum(-1) / np.maximum((along**2).sum(-1), 1e-12)
+    return np.linalg.norm(points[None] - a - np.clip(fraction, 0, 1)[..., None] * along, axis=-1).min(0)
 
 
 @pytest.mark.parametrize("kind", list(SceneKind))

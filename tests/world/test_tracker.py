@@ -146,8 +146,8 @@ def test_detection_falls_off_with_distance():
     config = replace(PERFECT, range=60.0, falloff=20.0, drop=0.1)
     reported = run(actors, config)
     near = np.linalg.norm(reported.position, axis=-1)
-    share = [(reported.valid & (abs(near - d) < 5.0)).sum() / frames for d in (40.0, 70.0, 90.0)]
-    np.testing.assert_allclose(share, [0.9, 0.45, 0.0], atol=0.05)
+    fraction = [(reported.valid & (abs(near - d) < 5.0)).sum() / frames for d in (40.0, 70.0, 90.0)]
+    np.testing.assert_allclose(fraction, [0.9, 0.45, 0.0], atol=0.05)
 
 
 def test_noise_grows_with_distance_and_is_correlated():
@@ -169,8 +169,8 @@ def test_a_building_hides_in_global_coordinates():
     actors = actors_at(still([[30.0, 0.0], [0.0, 30.0]], frames), [CAR] * 2)
     # 15 m ahead of the ego vehicle, which looks along global y.
     building = np.array([[100.0, 65.0, 8.0, 6.0, 0.0]])
-    share = visible_share(actors, ego, building, stride=1)
-    np.testing.assert_array_equal(share, np.tile([0.0, 1.0], (frames, 1)))
+    fraction = visible_share(actors, ego, building, stride=1)
+    np.testing.assert_array_equal(fraction, np.tile([0.0, 1.0], (frames, 1)))
     assert run(actors, replace(PERFECT, view_needed=0.3), ego=ego, buildings=building).valid.shape[1] == 1
 
 

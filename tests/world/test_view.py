@@ -69,8 +69,8 @@ def test_some_scenes_are_turned_as_all_would_be():
     kept = 0
     for number in range(8):
         straight, turned, some, none = (
-            pose_yaw(simulate(number, replace(world, view_turn=turn, view_turned=share)).global_from_ego)
-            for turn, share in ((0.0, 1.0), (30.0, 1.0), (30.0, 0.5), (30.0, 0.0))
+            pose_yaw(simulate(number, replace(world, view_turn=turn, view_turned=fraction)).global_from_ego)
+            for turn, fraction in ((0.0, 1.0), (30.0, 1.0), (30.0, 0.5), (30.0, 0.0))
         )
         np.testing.assert_array_equal(none, straight)
         kept += np.array_equal(some, straight)

@@ -98,8 +98,8 @@ def _save_errors(run: Run, task: Any, source: Any, stem: Path, meta: dict[str, A
             errors = lane_errors(task, params, arrays, run.config.evaluation.batch_size)
         for name, counts in (("true lanes", errors.lanes), ("detections", errors.detections)):
             every = sum(counts.values())
-            shares = {fate: 100.0 * number / every if every else 0.0 for fate, number in counts.items()}
-            rows.append({"of": name, "seed": seed, "number": every, "confidence": errors.threshold} | shares)
+            fractions = {fate: 100.0 * number / every if every else 0.0 for fate, number in counts.items()}
+            rows.append({"of": name, "seed": seed, "number": every, "confidence": errors.threshold} | fractions)
     title = "why lanes are not found, percent; detections with at least the confidence of the best F-score"
     print(f"\n{format_table(rows, title=title)}")
     return [*save_table(stem.with_name(f"{stem.name}-errors"), rows, meta, title=title)]

@@ -1,7 +1,7 @@
 """Recorded maps under the built-in world: one log gives any number of different frames.
 
 The ego vehicle and traffic are simulated on the maps of logs; evidence, cameras, markers, SD maps and tracks are those
-of the built-in world. A share of the scenes can have generated roads instead.
+of the built-in world. A fraction of the scenes can have generated roads instead.
 """
 
 from __future__ import annotations
@@ -91,8 +91,8 @@ class RealMapDataset(SimulatedDataset):
     def place(self, scene_id: int) -> MapFile | None:
         """Return the map of a scene; None for generated roads."""
         rng = np.random.default_rng([_ROOT, scene_id])
-        share, number = rng.random(), int(rng.integers(len(self.maps)))
-        return None if share < self.config.generated else self.maps[number]
+        fraction, number = rng.random(), int(rng.integers(len(self.maps)))
+        return None if fraction < self.config.generated else self.maps[number]
 
     def simulated(self, scene_id: int) -> Log:
         """Return the log of a scene."""

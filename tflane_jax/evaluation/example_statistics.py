@@ -22,7 +22,8 @@ _STANDS = 1.5
 def example_stats(example: Example, config: ExampleConfig) -> dict[str, float]:
     """Return the quantities of one example by name.
 
-    Of traffic, nothing if the history reaches back before the first track: it would look sparser than it is.
+    Traffic is left out where no track is valid in the oldest frame: a history that begins before the recording would
+    look sparser than it is.
     """
     lanes, flow = example.lanes, example.traffic_flow
     driven = None

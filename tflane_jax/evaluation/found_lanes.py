@@ -93,7 +93,16 @@ def segment_confidences(
 def highest_confidences(
     distance: Float[np.ndarray, " p"], nearest: Int[np.ndarray, " p"], scores: Float[np.ndarray, " p"], lanes: int
 ) -> Float[np.ndarray, " g"]:
-    """Return the same from the distance of each detection to its nearest lane (metres), which of `lanes` that is."""
+    """Return for each of `lanes` true lanes the highest confidence of a detection that lies within `WITHIN` of it.
+
+    A detection counts for its nearest lane alone; a lane without one has -inf.
+
+    Args:
+        distance: of each detection to its nearest lane, metres.
+        nearest: index of that lane.
+        scores: confidence of each detection.
+        lanes: number of true lanes.
+    """
     found, near = np.full(lanes, -np.inf), distance < WITHIN
     np.maximum.at(found, nearest[near], np.asarray(scores)[near])
     return found

@@ -110,9 +110,9 @@ def shown_fraction(
         tolerance: distance of the evidence, metres.
     """
     grid = BevGrid(ground, *bev.shape[:2])
-    reach = [2 * round(tolerance / size) + 1 for size in reversed(grid.cell)]  # cells along y and x
+    window = [2 * round(tolerance / size) + 1 for size in reversed(grid.cell)]  # cells along y and x
     evidence = np.asarray(bev)[..., list(channels)].max(-1)
-    shown = maximum_filter(evidence, reach, mode="constant") >= EVIDENCE
+    shown = maximum_filter(evidence, window, mode="constant") >= EVIDENCE
     found = np.zeros((len(left), SAMPLES), bool)
     for line in (left, right):
         points = _samples(line)

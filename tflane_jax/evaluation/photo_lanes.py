@@ -102,8 +102,8 @@ def judge_lanes(
     on_paint = [weight for weight, good in weights if good]
     trust = together * clean * (sum(weight for weight, _ in weights) + _LANE_WORTH * (len(lines) - 1))
     value = 0.0 if crossed else trust * aligned
-    share = len(on_paint) / len(supported)
-    rank = together * clean * aligned * share * (sum(on_paint) + _LANE_WORTH * max(len(on_paint) - 1, 0))
+    fraction = len(on_paint) / len(supported)
+    rank = together * clean * aligned * fraction * (sum(on_paint) + _LANE_WORTH * max(len(on_paint) - 1, 0))
     column, row = map(float, view.to_photo(meeting))
     return Judgement(value, 0.0 if crossed else rank, (column, row), trust, tuple(paint), tuple(supported), crossed)
 

@@ -84,6 +84,17 @@ class Evaluation:
     ratios: Mapping[str, SceneRatio] = field(default_factory=dict)
     samples: Callable[[], Mapping[str, SceneSamples]] = field(default=dict, compare=False)
 
+    def shown(self, group: str) -> dict[str, float]:
+        """Return the numbers of a group for a table: counts alone if it is a part of the lanes or lines and has none.
+
+        By the official convention it would have DET_l 1, which only the whole test set keeps.
+        """
+        values = self.groups[group]
+        whole = group.removeprefix("segments ") in ("all", "lines", "lines IoU")
+        if whole or values.get("lanes", values.get("lines")) != 0:
+            return dict(values)
+        return {name: value for name, value in values.items() if name in self.counts}
+
     def scores(self) -> dict[str, float]:
         """Return the scores by "group/name", without counts. Runs record them and rate checkpoints by them."""
         return {

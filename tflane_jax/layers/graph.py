@@ -69,8 +69,8 @@ class ElementGraphConvolution(nn.Module):
         (_, c), classes = elements.features.shape, elements.logits.shape[-1]
         init = nn.initializers.xavier_uniform(batch_axis=0)
         kernel = self.param("kernel", init, (classes, c, self.dim), jnp.float32)
-        share = nn.sigmoid(lax.stop_gradient(elements.logits))
-        support = jnp.einsum("ek,ec,kcd->ed", share, elements.features, kernel)
+        probability = nn.sigmoid(lax.stop_gradient(elements.logits))
+        support = jnp.einsum("ek,ec,kcd->ed", probability, elements.features, kernel)
         return self.edge_weight * (elements.edges @ support)
 
 

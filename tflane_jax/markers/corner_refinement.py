@@ -44,8 +44,8 @@ def refine_corners(
     blurred = cv2.GaussianBlur(board, (0, 0), spread * fine / cell, borderType=cv2.BORDER_REPLICATE)
     edge = fine // 2
     template = blurred[edge:-edge, edge:-edge].ravel().astype(np.float64)
-    share = (np.arange(edge, (n + 2) * fine - edge) + 0.5 - fine) / (n * fine)
-    s, t = (axis.ravel() for axis in np.meshgrid(share, share))
+    fraction = (np.arange(edge, (n + 2) * fine - edge) + 0.5 - fine) / (n * fine)
+    s, t = (axis.ravel() for axis in np.meshgrid(fraction, fraction))
     points = np.stack([s, t, np.ones_like(s)])
     around = 3.0 * spread + 2.0 * cell
     low = np.maximum(np.floor(corners.min(0) - around), 0).astype(int)

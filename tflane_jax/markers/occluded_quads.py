@@ -175,21 +175,21 @@ def _cell_score(smooth: UInt8[np.ndarray, "h w"], quads: Float[np.ndarray, "q 4 
     seen = _bilinear(smooth, quads, np.stack([s, t], -1))
     margin, border = (ring.ravel() for ring in rings(m))
     white, black = np.median(seen[:, margin], -1), np.median(seen[:, border], -1)
-    share = (seen - black[:, None]) / np.maximum(white - black, CONTRAST)[:, None]
-    bright, dark = (share > WHITE[0]) & (share < WHITE[1]), (share > BLACK[0]) & (share < BLACK[1])
+    fraction = (seen - black[:, None]) / np.maximum(white - black, CONTRAST)[:, None]
+    bright, dark = (fraction > WHITE[0]) & (fraction < WHITE[1]), (fraction > BLACK[0]) & (fraction < BLACK[1])
     inside = ~margin & ~border
     ring = 0.5 * (bright[:, margin].mean(-1) + dark[:, border].mean(-1))
     return 0.7 * ring + 0.3 * (bright | dark)[:, inside].mean(-1)
 
 
 def _bilinear(
-    smooth: UInt8[np.ndarray, "h w"], quads: Float[np.ndarray, "q 4 2"], share: Float[np.ndarray, "p 2"]
+    smooth: UInt8[np.ndarray, "h w"], quads: Float[np.ndarray, "q 4 2"], fraction: Float[np.ndarray, "p 2"]
 ) -> Float[np.ndarray, "q p"]:
     """Return the brightness at points given as fractions of each quad."""
-    s, t = share[:, :1], share[:, 1:]
+    s, t = fraction[:, :1], fraction[:, 1:]
     weight = np.concatenate([(1 - s) * (1 - t), s * (1 - t), s * t, (1 - s) * t], -1).astype(np.float32)
     corners = quads.astype(np.float32)
-    places = (weight @ corners.transpose(1, 0, 2).reshape(4, -1)).reshape(len(share), len(quads), 2)
+    places = (weight @ corners.transpose(1, 0, 2).reshape(4, -1)).reshape(len(fraction), len(quads), 2)
     return _pixels(smooth, places.transpose(1, 0, 2))
 
 

@@ -205,7 +205,7 @@ def _best_shade(
         shade[sides[0][0]] = True
         shades.append(shade.reshape(m, m))
     seen, board = _fine(grey, corners, cells, 3)
-    explained = [_share_explained(seen, board, shade) for shade in shades]
+    explained = [_fraction_explained(seen, board, shade) for shade in shades]
     best = int(np.argmax(explained))
     # A shadow edge must explain more than one that is not there.
     return shades[best] if explained[best] > explained[0] + 0.03 else shades[0]
@@ -218,7 +218,7 @@ def _explained(
     shaded: Bool[np.ndarray, "m m"],
 ) -> float:
     """Return the fraction of a board's points, margin included, that are as bright as the printed cells."""
-    return _share_explained(*_fine(grey, corners, cells, 6), shaded)
+    return _fraction_explained(*_fine(grey, corners, cells, 6), shaded)
 
 
 def _fine(
@@ -232,7 +232,7 @@ def _fine(
     return seen, cv2.GaussianBlur(board, (0, 0), _BLUR * fine / cell, borderType=cv2.BORDER_REPLICATE)
 
 
-def _share_explained(
+def _fraction_explained(
     seen: Float[np.ndarray, "k k"], board: Float[np.ndarray, "k k"], shaded: Bool[np.ndarray, "m m"]
 ) -> float:
     fine, right = len(seen) // len(shaded), 0
@@ -278,8 +278,8 @@ def _levelled(seen: Float[np.ndarray, "m m"]) -> _Levels | None:
             if white - black < CONTRAST:
                 break
             levels.append(white)
-            share = (flat[side] - black) / (white - black)
-            bright, dark = (share > WHITE[0]) & (share < WHITE[1]), (share > BLACK[0]) & (share < BLACK[1])
+            fraction = (flat[side] - black) / (white - black)
+            bright, dark = (fraction > WHITE[0]) & (fraction < WHITE[1]), (fraction > BLACK[0]) & (fraction < BLACK[1])
             read[side] = bright * 1.0 - dark * 1.0
         else:
             right = np.count_nonzero(read[margin] > 0.0) + np.count_nonzero(read[border] < 0.0)

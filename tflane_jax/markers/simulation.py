@@ -83,8 +83,8 @@ class MarkerSimulationConfig:
 
     def growth_at(self, distance: Float[np.ndarray, "*b"]) -> Float[np.ndarray, "*b"]:
         """Return the factor on the standard deviations at a distance (metres); 1 at `reference`."""
-        share = distance / self.reference
-        return share if self.growth == "linear" else share**2
+        fraction = distance / self.reference
+        return fraction if self.growth == "linear" else fraction**2
 
     def detection_probability(self, distance: Float[np.ndarray, "*b"]) -> Float[np.ndarray, "*b"]:
         """Return P_detect of a visible marker at a distance (metres)."""

@@ -198,7 +198,7 @@ def draw_projected(
     Args:
         ax, views, number: where, and which camera.
         lines: metres.
-        colour: of all lines; None: by direction, forward green, left blue, back red.
+        colour: of all lines; None: by direction, ahead green, left blue, back magenta, right orange.
         width: of the lines, points.
         dash: length of a dash and of dash with gap on the ground, metres; None draws whole lines.
     """

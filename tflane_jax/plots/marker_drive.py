@@ -150,8 +150,8 @@ def trust_colours(trust: float | Float[np.ndarray, " n"]) -> list[str]:
     """Return the colours of lanes by the confidence with which they enter the model, 0 to 1."""
     from matplotlib.colors import to_hex
 
-    share = np.clip(np.atleast_1d(trust), 0.0, 1.0)[:, None]
-    return [to_hex(colour) for colour in _DOUBTED + share * (_TRUSTED - _DOUBTED)]
+    fraction = np.clip(np.atleast_1d(trust), 0.0, 1.0)[:, None]
+    return [to_hex(colour) for colour in _DOUBTED + fraction * (_TRUSTED - _DOUBTED)]
 
 
 def _lanes(guidance: MarkerGuidance) -> tuple[Float[np.ndarray, "n k 3"], list[str]]:

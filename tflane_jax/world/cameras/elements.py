@@ -169,9 +169,11 @@ def unhidden(
         own: row of the first element's body in `boxes`; those of the others follow.
     """
     corners, faces = _corners(elements, ego_from_global)
-    share = np.array([(u, v) for u in (0.12, 0.5, 0.88) for v in (0.06, 0.35, 0.65, 0.94)])
+    fraction = np.array([(u, v) for u in (0.12, 0.5, 0.88) for v in (0.06, 0.35, 0.65, 0.94)])
     across, up = corners[:, 1] - corners[:, 0], corners[:, 3] - corners[:, 0]
-    points = corners[:, None, 0] + share[:, :1] * across[:, None] + share[:, 1:] * up[:, None] + 0.03 * faces[:, None]
+    points = (
+        corners[:, None, 0] + fraction[:, :1] * across[:, None] + fraction[:, 1:] * up[:, None] + 0.03 * faces[:, None]
+    )
     eye = invert_pose(camera.camera_from_ego)[:3, 3]
     x, y, length, width, yaw, low, high = boxes.T
     occluders = np.stack([x - eye[0], y - eye[1], length, width, yaw, high - low, low], -1)
@@ -181,7 +183,7 @@ def unhidden(
         np.zeros((0, 5)),
         sensor_height=float(eye[2]),
         target_height=points[..., 2].ravel(),
-        exclude=np.repeat(own + np.arange(len(corners)), len(share)),
+        exclude=np.repeat(own + np.arange(len(corners)), len(fraction)),
     )
     return hidden.reshape(len(corners), -1).mean(-1) <= 1.0 - _SEEN
 

@@ -193,13 +193,13 @@ def _add_paint(image: UInt8[np.ndarray, "h w 3"], paint: Paint, window: Window) 
         for ring, value in zip(corners, (255.0 * paint.left[rows]).tolist(), strict=True):
             cv2.fillPoly(mask, [ring], value, cv2.LINE_AA, SHIFT)
         painted = np.flatnonzero(mask)
-        share = mask.ravel()[painted].astype(np.float32) * np.float32(1.0 / 255.0)
+        fraction = mask.ravel()[painted].astype(np.float32) * np.float32(1.0 / 255.0)
         if rough is not None:
             # Partly worn paint is gone in patches; fresh and fully worn paint are uniform.
             height = (rough[np.unravel_index(painted, rough.shape)].astype(np.float32) - 128.0) / NOISE_SIGMA
-            share *= np.clip(1.0 + 1.6 * (1.0 - share) * np.minimum(height, 0.6), 0.0, 1.0)
+            fraction *= np.clip(1.0 + 1.6 * (1.0 - fraction) * np.minimum(height, 0.6), 0.0, 1.0)
         base = flat[painted].astype(np.float32)
-        base += share[:, None] * (255.0 * colour.astype(np.float32) - base)
+        base += fraction[:, None] * (255.0 * colour.astype(np.float32) - base)
         flat[painted] = base.astype(np.uint8)
 
 

@@ -35,7 +35,7 @@ def marker_bodies(markers: PlacedMarkers | None, covered: float = 0.0) -> Bodies
     Raises UserError for a fraction outside 0 to 1, a size that is not positive, or ids outside the family.
     """
     if not 0.0 <= covered <= 1.0:
-        raise UserError(f"the covered share of a marker is between 0 and 1, not {covered}")
+        raise UserError(f"the covered fraction of a marker is between 0 and 1, not {covered}")
     if markers is None:
         return pack([], [])
     if not markers.size > 0.0:

@@ -157,8 +157,8 @@ def _crossing(ring: Float[np.ndarray, "_ 2"], zebra: bool) -> Paint:
         return _strips(np.stack([a0, b0]), np.stack([a1, b1]), 0.3)
     across = float(np.linalg.norm(a1 - a0))
     count = max(int(across / _BAR_PERIOD), 1)
-    share = ((np.arange(count) + 0.5) / count)[:, None]
-    return _strips(a0 + share * (a1 - a0), b0 + share * (b1 - b0), _BAR)
+    fraction = ((np.arange(count) + 0.5) / count)[:, None]
+    return _strips(a0 + fraction * (a1 - a0), b0 + fraction * (b1 - b0), _BAR)
 
 
 def _at_lane_ends(vector_map: VectorMap, arrows: bool) -> list[Paint]:

@@ -56,10 +56,10 @@ def paint_picture(
     row = np.where(inside, (1.0 - up) * rows, 0.0).astype(int).clip(0, rows - 1)
     column = np.where(inside, across * columns, 0.0).astype(int).clip(0, columns - 1)
     light = np.where(inside, picture[row, column], 0.0)
-    share, light = (
+    fraction, light = (
         part.reshape(bottom - top, fine, right - left, fine).mean((1, 3))[..., None]
         for part in (inside.astype(np.float32), light.astype(np.float32))
     )
     behind = image[top:bottom, left:right]
-    seen = (1.0 - share) * behind + (share - light) * tones[0] + light * tones[1]
+    seen = (1.0 - fraction) * behind + (fraction - light) * tones[0] + light * tones[1]
     image[top:bottom, left:right] = np.round(np.clip(seen, 0.0, 255.0)).astype(np.uint8)

@@ -215,8 +215,8 @@ def _ground_colour(moment: Moment, view: View, x: np.ndarray, y: np.ndarray) -> 
             continue
         part = slice(rows[0], rows[-1] + 1)
         fine = sample_ground(ground, x[part] + shift[0], y[part] + shift[1], view.across[part], view.along[part])
-        share = np.clip((NEAR_REACH - 1.0 - reach[part]) * 0.25, 0.0, 1.0)[..., None]
-        colour[part] += share * (fine - colour[part])
+        fraction = np.clip((NEAR_REACH - 1.0 - reach[part]) * 0.25, 0.0, 1.0)[..., None]
+        colour[part] += fraction * (fine - colour[part])
     assert colour is not None
     return colour
 

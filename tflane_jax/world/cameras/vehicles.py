@@ -63,8 +63,8 @@ def road_user(
     return [(solid, (0.0, 0.0, length, width, 0.0, 0.0, height))]
 
 
-def _pick(colours: tuple[Colour, ...], share: float) -> Colour:
-    return colours[min(int(share * len(colours)), len(colours) - 1)]
+def _pick(colours: tuple[Colour, ...], fraction: float) -> Colour:
+    return colours[min(int(fraction * len(colours)), len(colours) - 1)]
 
 
 def _shaded(colour: Colour, factor: float) -> Colour:

@@ -84,5 +84,5 @@ def draw_stains(
         for lane in road.lanes:
             place = rng.uniform(6.0, 40.0) + _ARROW[:, 0], lane + _ARROW[:, 1] * rng.uniform(1.0, 1.6)
             cv2.fillPoly(paint, [seen(*place)], 190, cv2.LINE_AA, SHIFT)
-        share = paint * np.float32(1.0 / 255.0)
-        colour += share * (np.float32(0.85) - colour)
+        fraction = paint * np.float32(1.0 / 255.0)
+        colour += fraction * (np.float32(0.85) - colour)

@@ -63,8 +63,8 @@ def look_at_ground(camera: FrontCamera, axis: ReferenceLine) -> Ground:
 
 
 def _between_columns(coarse: Float[np.ndarray, "c h k"]) -> Float[np.ndarray, "c h w"]:
-    share = (np.arange(_COLUMNS) / _COLUMNS).astype(np.float32)
-    fine = np.diff(coarse, axis=-1)[..., None] * share
+    fraction = (np.arange(_COLUMNS) / _COLUMNS).astype(np.float32)
+    fine = np.diff(coarse, axis=-1)[..., None] * fraction
     fine += coarse[..., :-1, None]
     return fine.reshape(*coarse.shape[:-1], -1)
 

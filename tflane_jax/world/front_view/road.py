@@ -147,12 +147,12 @@ def draw_highway(rng: np.random.Generator, config: HighwayConfig, wear: float) -
     lines = np.repeat(width * np.arange(count + 1.0)[:, None], n, axis=1)
     present = np.ones((count + 1, n), bool)
     extra = _extra_lane(rng, config)
-    share = np.zeros(n) if extra is None else extra.presence(axis.s)
+    fraction = np.zeros(n) if extra is None else extra.presence(axis.s)
     outer = count * width
     if extra is not None:
-        lines = np.concatenate([lines, (outer + width * share)[None]])
+        lines = np.concatenate([lines, (outer + width * fraction)[None]])
         present = np.concatenate([present, np.ones((1, n), bool)])
-        present[-2] = share > _SEPARATED
+        present[-2] = fraction > _SEPARATED
 
     inner = 0.0 if two_way else rng.uniform(*config.inner_shoulder)
     apron = rng.uniform(*config.outer_shoulder)

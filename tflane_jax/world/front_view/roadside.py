@@ -168,8 +168,8 @@ def _signs(rng: np.random.Generator, road: Highway, right: float) -> list[Solid]
         for post in posts:
             box(solid, post, heading[0], (0.4, 0.4), (0.0, 7.2), _POST)
         box(solid, posts.mean(0), heading[0], (0.4, right_end - left_end), (6.4, 7.2), _POST)
-        for share in rng.uniform(0.15, 0.85, rng.integers(1, 4)):
-            centre = posts[0] + share * (posts[1] - posts[0])
+        for fraction in rng.uniform(0.15, 0.85, rng.integers(1, 4)):
+            centre = posts[0] + fraction * (posts[1] - posts[0])
             solid_sign = Solid(solid.distance - 1.0)
             box(solid_sign, centre, heading[0], (0.2, rng.uniform(2.5, 5.0)), (5.6, 7.8), (0.05, 0.33, 0.2))
             solids.append(solid_sign)

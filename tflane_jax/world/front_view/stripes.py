@@ -36,11 +36,11 @@ def draw_stripe(
     u = column + 0.5
     reach = 0.5 * blur[line]
     covered = np.minimum(u + reach, right[line]) - np.maximum(u - reach, left[line])
-    share = np.clip(covered / blur[line], 0.0, 1.0) * strength[line]
+    fraction = np.clip(covered / blur[line], 0.0, 1.0) * strength[line]
     row = seen[line]
-    share = share.astype(np.float32)
+    fraction = fraction.astype(np.float32)
     for channel, value in zip(colour, stripe.colour, strict=True):
-        channel[row, column] += share * (np.float32(value) - channel[row, column])
+        channel[row, column] += fraction * (np.float32(value) - channel[row, column])
 
 
 def _dashed(

@@ -69,8 +69,8 @@ def draw_traffic(rng: np.random.Generator, road: Highway, config: FrontTrafficCo
                 places.append((s, offset, ours))
                 s += _LONGEST
     table = np.array(places, np.float64).reshape(-1, 3)
-    share = np.asarray(config.categories) / np.sum(config.categories)
-    category = np.array(_CATEGORIES, np.int32)[rng.choice(len(_CATEGORIES), len(table), p=share)]
+    probability = np.asarray(config.categories) / np.sum(config.categories)
+    category = np.array(_CATEGORIES, np.int32)[rng.choice(len(_CATEGORIES), len(table), p=probability)]
     drivers = draw_drivers(rng, category)
     s, ours = table[:, 0] + 0.5 * drivers.size[:, 0], table[:, 2] > 0.0
     _, heading = road.axis.at(s)

@@ -89,8 +89,8 @@ def clipped(points: Float[np.ndarray, "m 3"], depth: Float[np.ndarray, " m"]) ->
     after, depth_after = np.roll(points, -1, 0), np.roll(depth, -1)
     inside = depth > NEAR
     crosses = inside != (depth_after > NEAR)
-    share = np.where(crosses, (NEAR - depth) / np.where(crosses, depth_after - depth, 1.0), 0.0)
-    cut = points + share[:, None] * (after - points)
+    fraction = np.where(crosses, (NEAR - depth) / np.where(crosses, depth_after - depth, 1.0), 0.0)
+    cut = points + fraction[:, None] * (after - points)
     both = np.stack([points, cut], 1).reshape(-1, 3)
     return both[np.stack([inside, crosses], 1).ravel()]
 

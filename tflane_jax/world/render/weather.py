@@ -120,9 +120,9 @@ def draw_weather(rng: np.random.Generator, config: FrontWeatherConfig, severity:
         severity: 0 (clear, fresh paint, a perfect camera) to 1.
     """
     kinds, weights = zip(*config.kinds, strict=True)
-    share = severity * np.asarray(weights) / np.sum(weights)
-    share[kinds.index(Sky.CLEAR)] += 1.0 - severity
-    kind = kinds[rng.choice(len(kinds), p=share / share.sum())]
+    probability = severity * np.asarray(weights) / np.sum(weights)
+    probability[kinds.index(Sky.CLEAR)] += 1.0 - severity
+    kind = kinds[rng.choice(len(kinds), p=probability / probability.sum())]
     direct, ambient, zenith, horizon, cloud = _LIGHT[kind]
     azimuth = rng.uniform(-np.pi, np.pi)
     low = kind in (Sky.LOW_SUN, Sky.DUSK)

@@ -45,13 +45,15 @@ def draw_driveways(
     crossings = np.concatenate([np.zeros((0, 2)), *site.crossings])
     # Nothing is drawn where there are no access roads: other worlds stay what they were.
     spread = min(config.access_share, 1.0 - config.access_share)
-    share = draw(rng, (config.access_share - spread, config.access_share + spread)) if spread else config.access_share
+    fraction = (
+        draw(rng, (config.access_share - spread, config.access_share + spread)) if spread else config.access_share
+    )
     for number, kerb in enumerate(site.kerbs):
         length = arc_length(kerb)[-1]
         others = [points_at(k, np.arange(0.0, arc_length(k)[-1], 1.0)) for k in (*site.kerbs, *site.islands)]
         last = -np.inf
         for middle in np.sort(rng.uniform(0.0, length, rng.poisson(config.driveways * length / 100.0))).tolist():
-            access = share > 0.0 and chance(rng, share)
+            access = fraction > 0.0 and chance(rng, fraction)
             width = draw(rng, config.access_width if access else config.driveway_width)
             rounding = draw(rng, config.access_rounding) if access else _FLARE
             depth = draw(rng, config.driveway_depth) + (rounding if access else 0.0)

@@ -221,9 +221,9 @@ def lay_connectors(
         elif _passes_an_arm(m, len(approaches)):
             radius[k] = _clearest(m, corners, [(r, _HANDLES[0]) for r in _RADII_PAST])[0]
     center, heading = blend(start, inbound, stop, onward, count, radius, handle)
-    share = np.linspace(0.0, 1.0, count)
+    fraction = np.linspace(0.0, 1.0, count)
     widths = np.array([[m.source.width, m.sink.width] for m in movements])
-    half = 0.5 * (widths[:, :1] + (widths[:, 1:] - widths[:, :1]) * share)
+    half = 0.5 * (widths[:, :1] + (widths[:, 1:] - widths[:, :1]) * fraction)
     side = half[..., None] * right_of(heading)
     left, right = center - side, center + side
     for k, m in enumerate(movements):

@@ -161,8 +161,8 @@ def _distance(
 ) -> Float[np.ndarray, " n"]:
     """Return the distances of points from the segment between two others."""
     along = stop - start
-    share = np.clip((points - start) @ along / max(float(along @ along), 1e-12), 0.0, 1.0)
-    return np.linalg.norm(points - start - share[:, None] * along, axis=-1)
+    fraction = np.clip((points - start) @ along / max(float(along @ along), 1e-12), 0.0, 1.0)
+    return np.linalg.norm(points - start - fraction[:, None] * along, axis=-1)
 
 
 def crossing_line(ring: Float[np.ndarray, "5 2"]) -> Float[np.ndarray, "2 2"]:

@@ -169,12 +169,12 @@ def _build_side(
 
     dividers = line.offset(plan.inner + w * np.arange(plan.lanes + 1)[:, None] + shift)
     columns = [_Column(a, b, None) for a, b in pairwise(dividers)]
-    for extra, share in zip(plan.extras, presence, strict=True):
+    for extra, fraction in zip(plan.extras, presence, strict=True):
         # Where share = 1 the boundary is bit-identical to the neighbour's.
         if extra.place is Place.RIGHT:
-            left, right = plan.outer + shift - w * (1.0 - share), plan.outer + shift + w * share
+            left, right = plan.outer + shift - w * (1.0 - fraction), plan.outer + shift + w * fraction
         else:
-            left, right = plan.inner + shift - w * share, plan.inner + shift + w * (1.0 - share)
+            left, right = plan.inner + shift - w * fraction, plan.inner + shift + w * (1.0 - fraction)
         columns.append(_Column(line.offset(left), line.offset(right), extra))
     at = np.searchsorted(t, cuts - SAME_STATION)
 

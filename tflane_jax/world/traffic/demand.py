@@ -96,8 +96,8 @@ def draw_trips(
         category_share: motor vehicles by category.
         junctions: intersections that share the vehicles.
     """
-    categories, shares = zip(*category_share, strict=True)
-    shares = np.array(shares) / np.sum(shares)
+    categories, fractions = zip(*category_share, strict=True)
+    fractions = np.array(fractions) / np.sum(fractions)
     entered = {j for following in table.successors for j in following}
     enters: list[np.ndarray] = []
     category: list[np.ndarray] = []
@@ -111,7 +111,7 @@ def draw_trips(
         if table.vehicle[lane]:
             flow = min(busy * vehicles_per_metre * table.speed_at_start[lane], capacity)
             times = _arrivals(rng, start, stop, flow)
-            kind = rng.choice(categories, size=len(times), p=shares)
+            kind = rng.choice(categories, size=len(times), p=fractions)
             shared = outer[lane] and table.speed_at_start[lane] < _SHARED_LANE_SPEED
             ratio = bicycles_per_metre / max(vehicles_per_metre + bicycles_per_metre, 1e-9)
             at_edge = (rng.random(len(times)) < 0.5 * ratio) & shared

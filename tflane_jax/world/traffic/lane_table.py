@@ -156,8 +156,8 @@ def _sample(
     length = stop - start
     count = np.maximum(np.ceil(length / _SPACING).astype(int), 1) + 1
     owner = np.repeat(np.arange(len(lines)), count)
-    share = (np.arange(len(owner)) - (np.cumsum(count) - count)[owner]) / (count - 1)[owner]
-    at = start[owner] + share * length[owner]
+    fraction = (np.arange(len(owner)) - (np.cumsum(count) - count)[owner]) / (count - 1)[owner]
+    at = start[owner] + fraction * length[owner]
     return np.stack([np.interp(at, along, points[:, i]) for i in range(2)], -1), length, count
 
 

@@ -82,10 +82,10 @@ def crossing_places(walks: tuple[Float[np.ndarray, "2 2"], ...], table: LaneTabl
     inner = owner[1:] == owner[:-1]
     crossing, vertex = np.nonzero((across[:, 1:] * across[:, :-1] < 0.0) & inner)
     a, b = across[crossing, vertex], across[crossing, vertex + 1]
-    share = a / (a - b)
-    at = along[crossing, vertex] * (1.0 - share) + along[crossing, vertex + 1] * share
+    fraction = a / (a - b)
+    at = along[crossing, vertex] * (1.0 - fraction) + along[crossing, vertex + 1] * fraction
     segment = owner[vertex]
-    station = (vertex - table.first_vertex[segment] + share) * table.step[segment]
+    station = (vertex - table.first_vertex[segment] + fraction) * table.step[segment]
     inside = (at > 0.0) & (at < length[crossing])
     return CrossingPlaces(segment[inside], station[inside], crossing[inside], at[inside])
 

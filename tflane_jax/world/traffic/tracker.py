@@ -120,7 +120,7 @@ def visible_share(
     """Return the visible fraction of each box's probe points, computed every `stride` frames; 0 where not valid."""
     frames, count = actors.valid.shape
     looks = np.unique(np.append(np.arange(0, frames, stride), frames - 1)) if frames else np.zeros(0, int)
-    share = np.zeros((len(looks), count))
+    fraction = np.zeros((len(looks), count))
     to_ego = invert_pose(global_from_ego)
     heading = pose_yaw(global_from_ego)
     for row, f in enumerate(looks):
@@ -144,15 +144,15 @@ def visible_share(
             target_height=np.repeat(base + 0.6 * size[:, 2], len(_PROBES)),
             exclude=np.repeat(np.arange(len(k)), len(_PROBES)),
         )
-        share[row, k] = 1.0 - hidden.reshape(len(k), -1).mean(1)
+        fraction[row, k] = 1.0 - hidden.reshape(len(k), -1).mean(1)
     if len(looks) == frames:
-        return share
+        return fraction
     nearest = np.searchsorted(looks, np.arange(frames), side="right") - 1
     following = np.minimum(nearest + 1, len(looks) - 1)
     weight = (np.arange(frames) - looks[nearest]) / np.maximum(looks[following] - looks[nearest], 1)
     # An actor that is absent at one of the two frames has no value there to interpolate with.
-    before = np.where(actors.valid[looks[nearest]], share[nearest], share[following])
-    after = np.where(actors.valid[looks[following]], share[following], share[nearest])
+    before = np.where(actors.valid[looks[nearest]], fraction[nearest], fraction[following])
+    after = np.where(actors.valid[looks[following]], fraction[following], fraction[nearest])
     return np.where(actors.valid, before + weight[:, None] * (after - before), 0.0)
 
 
@@ -172,8 +172,8 @@ def _detections(
         chance = np.where(distance <= config.range, 1.0, 0.0)
     if config.view_needed > 0.0:
         stride = max(1, int(config.look_every_s * rate_hz + 1e-9))
-        share = visible_share(actors, global_from_ego, buildings, stride)
-        chance = chance * np.clip(share / config.view_needed, 0.0, 1.0)
+        fraction = visible_share(actors, global_from_ego, buildings, stride)
+        chance = chance * np.clip(fraction / config.view_needed, 0.0, 1.0)
     return actors.valid & (rng.random(distance.shape) < chance * (1.0 - config.drop))
 
 

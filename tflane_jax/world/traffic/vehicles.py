@@ -77,11 +77,11 @@ def draw_drivers(rng: np.random.Generator, category: Int[np.ndarray, " n"]) -> D
     """Draw one road user for each given category. The number of draws from `rng` depends on N alone."""
     n = len(category)
     profiles = [PROFILES[RoadUser(c)] for c in category]
-    share = rng.random((9, n))
+    fraction = rng.random((9, n))
 
     def draw(row: int, ranges: list[Range]) -> Float[np.ndarray, " n"]:
         low, high = np.array(ranges).reshape(n, 2).T
-        return low + share[row] * (high - low)
+        return low + fraction[row] * (high - low)
 
     limit = np.array([p.wander for p in profiles])
     return Drivers(
@@ -95,11 +95,12 @@ def draw_drivers(rng: np.random.Generator, category: Int[np.ndarray, " n"]) -> D
             -1,
         ),
         eagerness=draw(3, [p.eagerness for p in profiles]),
-        top_speed=np.array([p.top_speed for p in profiles]) * (1.0 - 0.3 * share[3] * (category >= RoadUser.BICYCLE)),
+        top_speed=np.array([p.top_speed for p in profiles])
+        * (1.0 - 0.3 * fraction[3] * (category >= RoadUser.BICYCLE)),
         acceleration=draw(4, [p.acceleration for p in profiles]),
         headway=draw(5, [p.headway for p in profiles]),
         # Half of the lateral range is a constant offset, half is oscillation.
-        wander=0.5 * limit * (2.0 * share[6] - 1.0),
-        offset=0.5 * limit * (2.0 * share[7] - 1.0),
-        phase=2.0 * np.pi * share[8],
+        wander=0.5 * limit * (2.0 * fraction[6] - 1.0),
+        offset=0.5 * limit * (2.0 * fraction[7] - 1.0),
+        phase=2.0 * np.pi * fraction[8],
     )

@@ -148,6 +148,14 @@ def with_remat(config: RunConfig, precision: Precision = "float32") -> RunConfig
     return dataclasses.replace(config, task=dataclasses.replace(config.task, model=model))
 
 
+def with_epochs(config: RunConfig, epochs: int) -> RunConfig:
+    """Return a configuration that trains for another number of epochs, each of `optim.epoch_steps` updates."""
+    steps = epochs * config.optim.epoch_steps
+    if steps == 0:
+        raise UserError("optim.epoch_steps is 0: the configuration does not say how long an epoch is")
+    return dataclasses.replace(config, training=dataclasses.replace(config.training, steps=steps))
+
+
 def _run_function(path: Path, function: str, kind: type[T]) -> T:
     """Run a config file and return the result of one of its functions."""
     spec = importlib.util.spec_from_file_location(f"tflane_config_{path.stem}", path)

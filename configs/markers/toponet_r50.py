@@ -5,11 +5,11 @@
     tflane train --config markers/toponet_r50 --data.root PATH
 
 Section IV-C: ResNet-50 from ImageNet, 2048 x 1550 pixels with random resizing and colours, 200 x 100 BEV cells of half
-a metre, AdamW, a cosine of 24 epochs from 1e-4, one frame at a time. The encoder is that of OpenLane-V2's large
-baseline, six layers, with Eq. (3) as written in each. A scene has one board. Ours: one clip of four frames for an
-update, the range of the resizing, and the clear place of a board. Of the 28 images of a clip, one feature map of 256
-channels at a quarter of the size takes 5.4 GiB, so that every part recomputes its activations, and the frames pass in a
-loop. Not trained.
+a metre, AdamW, a cosine of 24 epochs from 1e-4, one frame at a time. The paper gives no number of encoder layers:
+three, as TopoNet and OpenLane-V2's large baseline have, with Eq. (3) as written in each. A scene has one board. Ours:
+one clip of four frames for an update, the range of the resizing, and the clear place of a board. Of the 28 images of a
+clip, one feature map of 256 channels at a quarter of the size takes 5.4 GiB, so that every part recomputes its
+activations, and the frames pass in a loop. Not trained.
 """
 
 from dataclasses import replace
@@ -99,10 +99,10 @@ def _row(priors: PriorsConfig, host: str = "toponet_r50") -> RunConfig:
 
 
 def _bev(model: HostConfig) -> HostConfig:
-    """Return the host with the paper's BEV grid and the baseline's six layers."""
+    """Return the host with the paper's BEV grid."""
     assert isinstance(model.encoder, CameraEncoderConfig)
     assert isinstance(model.encoder.bev, BevFormerConfig)
-    return replace(model, encoder=replace(model.encoder, bev=replace(model.encoder.bev, grid=GRID, layers=6)))
+    return replace(model, encoder=replace(model.encoder, bev=replace(model.encoder.bev, grid=GRID)))
 
 
 def _recomputing(model: HostConfig, priors: PriorsConfig) -> HostConfig:

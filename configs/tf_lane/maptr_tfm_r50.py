@@ -5,27 +5,30 @@
     tflane train --config tf_lane/maptr_tfm_r50 --data.root PATH \\
         --training.init-from runs/imagenet --training.init-partly
 
-Host, images, labels and recipe are those of `maptr_r50:published_weights`, the module that of `toponet_tfm_r50.py`.
-Past frames are the key frames before, at 2 Hz. `:remat` recomputes activations in the backward pass, `:bfloat16` does
-so in half precision.
+Host, images, labels and recipe are those of `maptr_r50:published_weights`, module and epochs those of
+`toponet_tfm_r50.py`. Past frames are the key frames before, at 2 Hz. `:remat` recomputes activations in the backward
+pass, `:bfloat16` does so in half precision; `:host` is the baseline without the module.
 """
 
 from dataclasses import replace
 from pathlib import Path
 
-from tflane_jax.config import NuScenesData, RunConfig, load_config, with_priors_of, with_remat
+from tflane_jax.config import NuScenesData, RunConfig, load_config, with_epochs, with_priors_of, with_remat
 
 HERE = Path(__file__)
+HOST = str(HERE.with_name("maptr_r50.py:published_weights"))
+EPOCHS = 60
 
 
 def get_config() -> RunConfig:
     """Return the paper's host with the module."""
-    host = load_config(str(HERE.with_name("maptr_r50.py:published_weights")))
-    config = with_priors_of(load_config(str(HERE.with_name("toponet_tfm_r50.py"))), host)
+    config = with_priors_of(load_config(str(HERE.with_name("toponet_tfm_r50.py"))), load_config(HOST))
     assert isinstance(config.data, NuScenesData)
-    return replace(config, data=replace(config.data, example=replace(config.data.example, history_hz=2.0)))
+    config = replace(config, data=replace(config.data, example=replace(config.data.example, history_hz=2.0)))
+    return with_epochs(config, EPOCHS)
 
 
 def ablations() -> dict[str, RunConfig]:
-    """Return variants of the encoder."""
-    return {"remat": with_remat(get_config()), "bfloat16": with_remat(get_config(), "bfloat16")}
+    """Return variants of the encoder, and the host alone."""
+    rows = {"remat": with_remat(get_config()), "bfloat16": with_remat(get_config(), "bfloat16")}
+    return rows | {"host": with_epochs(load_config(HOST), EPOCHS)}

@@ -5,20 +5,22 @@
     tflane train --config tf_lane/toponet_tfm_r50 --data.root PATH --data.tracks PATH \\
         --training.init-from runs/imagenet --training.init-partly
 
-Host, schedule and memory are those of `camera/toponet_r50`, with the same ablations `:remat`, `:bfloat16`,
-`:six_layers` and `:published_weights`. Past frames come at 2 Hz, as key frames do. TF-Lane does not give the sizes of
-its module: it is as wide as the host here.
+Host, recipe and memory are those of `camera/toponet_r50`, with the same ablations `:remat`, `:bfloat16`, `:six_layers`
+and `:published_weights`, but for 60 epochs as TF-Lane trains all models; `:host` is the baseline without the module.
+Past frames come at 2 Hz, as key frames do. TF-Lane does not give the sizes of its module: it is as wide as the host
+here.
 """
 
 from dataclasses import replace
 from pathlib import Path
 
-from tflane_jax.config import OpenLaneV2Data, RunConfig, load_ablations, load_config
+from tflane_jax.config import OpenLaneV2Data, RunConfig, load_ablations, load_config, with_epochs
 from tflane_jax.models.priors import PriorsConfig
 from tflane_jax.models.traffic_flow_module import TrafficFlowConfig, TrafficFlowModuleConfig
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 
 HOST = str(Path(__file__).parent.with_name("camera") / "toponet_r50.py")
+EPOCHS = 60
 TRAFFIC_FLOW = TrafficFlowConfig(module=TrafficFlowModuleConfig(width=256, heads=8))
 
 
@@ -28,8 +30,9 @@ def get_config() -> RunConfig:
 
 
 def ablations() -> dict[str, RunConfig]:
-    """Return the variants of the host."""
-    return {name: _with_traffic_flow(row) for name, row in load_ablations(HOST).items()}
+    """Return the variants of the host, and the host alone."""
+    rows = {name: _with_traffic_flow(row) for name, row in load_ablations(HOST).items()}
+    return rows | {"host": with_epochs(load_config(HOST), EPOCHS)}
 
 
 def _with_traffic_flow(config: RunConfig) -> RunConfig:
@@ -40,4 +43,4 @@ def _with_traffic_flow(config: RunConfig) -> RunConfig:
     data = replace(
         config.data, tracks=Path("data/argoverse2"), example=replace(config.data.example, history_hz=2.0, tracks=128)
     )
-    return replace(config, task=replace(config.task, model=model), data=data)
+    return with_epochs(replace(config, task=replace(config.task, model=model), data=data), EPOCHS)

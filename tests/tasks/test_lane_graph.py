@@ -38,6 +38,7 @@ from tflane_jax.world.bev.sensor import BevSensorConfig
 
 WIDE = PerceptionRange((-60.0, 60.0), (-30.0, 30.0))
 EXAMPLES = stack_examples([make_example()])
+LANES_AND_AREAS = LaneSegNetConfig(decoder=replace(LaneSegNetConfig().decoder, classes=1), areas=AreaDecoderConfig())
 
 
 def test_shipped_ranges_fit():
@@ -61,25 +62,24 @@ def test_a_raster_that_does_not_fold_is_named():
 
 
 @pytest.mark.parametrize(
-    ("model", "setting"),
+    ("model", "setting", "reason"),
     [
-        (TopoNetConfig(), "lane_points"),
-        (BevFormerDetrConfig(encoder=EvidenceEncoderConfig(), elements=None), "lane_points"),
-        (LaneSegNetConfig(), "segment_points"),
-        (LaneSegNetConfig(), "area_points"),
+        (TopoNetConfig(), "lane_points", "as many as it predicts for a lane"),
+        (BevFormerDetrConfig(encoder=EvidenceEncoderConfig(), elements=None), "lane_points", "as many as it predicts"),
+        (LaneSegNetConfig(), "segment_points", "as many as it predicts for a segment"),
+        (LaneSegNetConfig(), "area_points", "two sides of a crossing with 10 points each"),
+        (LANES_AND_AREAS, "area_points", "as many as it predicts for an area"),
     ],
 )
-def test_truth_of_other_points_is_named(model, setting):
+def test_truth_of_other_points_is_named(model, setting, reason):
     task, forms = LaneGraphTask(model), {name: value for name, (value, _) in model.example_forms.items()}
     task.check(WorldData(example=ExampleConfig(**forms)), EXAMPLES)
-    with pytest.raises(UserError, match=rf"data\.example\.{setting}=\d+, .*not 7"):
-        task.check(WorldData(example=ExampleConfig(**{setting: 7})), EXAMPLES)
+    with pytest.raises(UserError, match=rf"data\.example\.{setting}=\d+, {reason}.*not 7"):
+        task.check(WorldData(example=ExampleConfig(**forms, **{setting: 7})), EXAMPLES)
 
 
 def test_crossings_in_the_form_of_another_host_are_named():
-    segments = LaneSegNetConfig()
-    areas = LaneSegNetConfig(decoder=replace(segments.decoder, classes=1), areas=AreaDecoderConfig())
-    for model, own, other in ((segments, "sides", "ring"), (areas, "ring", "sides")):
+    for model, own, other in ((LaneSegNetConfig(), "sides", "ring"), (LANES_AND_AREAS, "ring", "sides")):
         task = LaneGraphTask(model)
         task.check(WorldData(example=ExampleConfig(crossings=own)), EXAMPLES)
         with pytest.raises(UserError, match=rf"data\.example\.crossings={own}, not {other}: it learns a crossing as"):

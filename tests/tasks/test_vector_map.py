@@ -50,8 +50,8 @@ class KnowingConfig(HostConfig):
         return 8
 
     @property
-    def example_points(self) -> dict[str, int]:
-        return {"map_lines.points": 20}
+    def example_points(self) -> dict[str, tuple[int, str]]:
+        return {"map_lines.points": (20, "as many as it predicts")}
 
     def build(self) -> Knowing:
         return Knowing(self)

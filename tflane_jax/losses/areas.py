@@ -76,7 +76,5 @@ def area_loss(
         class_target=config.class_target,
     )
     loss, report = line_loss(LinePrediction(prediction.points, prediction.logits), targets, _METRES, weights)
-    names = {"matching/lines": "matching/areas"} | {
-        f"{name}": f"area_{name}" for name in ("class", "points", "direction")
-    }
+    names = {"matching/lines": "matching/areas"} | {name: f"area_{name}" for name in ("class", "points", "direction")}
     return loss, {names[name]: value for name, value in report.items()}

@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float
 
 from tflane_jax.geometry.lane_shapes import curve_columns
 from tflane_jax.limits import Positive, PositiveOrZero
-from tflane_jax.losses.common import Report
+from tflane_jax.losses.common import Report, matched
 from tflane_jax.matching import Assignment, match
 from tflane_jax.models.auxiliary import AuxiliaryOutputs
 from tflane_jax.models.lstr import LstrConfig
@@ -30,9 +30,9 @@ class LaneShapeLossConfig:
         extent_weight: omega_3, for the rows where a lane begins and ends.
         cell_weight: weight of the auxiliary loss on cells, for networks that have it; LSTR does not.
         shared_horizon: the target of every lane begins at the highest row of all lanes in the image, as in LSTR.
-        least_depth: smallest distance of a row below the predicted horizon, as a fraction of the image height; smaller
-            ones are clamped. The curve has a pole at the horizon; with LSTR's 1e-6, training rarely recovers from a
-            predicted horizon close to a point's row.
+        least_depth: rows nearer to the predicted horizon than this fraction of the image height, above or below it,
+            are evaluated this far below it. The curve has a pole at the horizon; with LSTR's 1e-6, training rarely
+            recovers from a predicted horizon close to a point's row.
         matcher: backend of `matching.match`.
     """
 
@@ -123,7 +123,10 @@ def curve_errors(
 
 
 def cell_loss(logits: Float[Array, "h w"], targets: LaneShapeTargets) -> Float[Array, ""]:
-    """Return the mean cross-entropy over one example's cells; a cell is positive if it contains a lane-line point."""
+    """Return the mean cross-entropy over one example's cells; a cell is positive if it contains a lane-line point.
+
+    Cells of image padding count as empty.
+    """
     height, width = logits.shape
     inside = targets.point_valid & (targets.columns >= 0) & (targets.columns < 1)
     inside &= (targets.rows >= 0) & (targets.rows < 1)
@@ -165,7 +168,7 @@ def lane_shape_loss(
     cost = jax.vmap(lambda p, t, w: matching_cost(p, t, w, config))(prediction, targets, every)
     assignment = match(cost, targets.valid[:, None], config.matcher)  # z of Eq. (3), (B, D, L): one host call
     # The weights of a layer use the lanes matched in that layer.
-    weights = jax.vmap(lambda matched: lane_weights(targets, matched), in_axes=1, out_axes=1)(assignment.matched)
+    weights = jax.vmap(lambda which: lane_weights(targets, which), in_axes=1, out_axes=1)(assignment.matched)
     per_layer = jax.vmap(jax.vmap(lambda p, a, w, t: _terms(p, a, w, t, config), in_axes=(0, 0, 0, None)))
     classes, curves, extents = per_layer(prediction, assignment, weights, targets)  # each (B, D)
 
@@ -177,7 +180,7 @@ def lane_shape_loss(
     }
     total = jnp.stack(list(terms.values())).sum()
     report = {name: value[-1] for name, value in terms.items()}
-    report["matching/lanes"] = assignment.matched[:, -1].sum(-1).astype(jnp.float32).mean()
+    report["matching/lanes"] = matched(assignment)
     return total, report
 
 
@@ -204,7 +207,7 @@ def _terms(
 
 
 def _shape(curves: Float[Array, "*b 8"]) -> Float[Array, "*b 6"]:
-    """Return k'', f'', m'', n', b'', b''' of g_t, Eq. (8); its first two are alpha and beta."""
+    """Return k'', f'', m'', n', b'', b''' of g_t, Eq. (8); predicted curves hold alpha and beta before them."""
     return curves[..., 2:]
 
 

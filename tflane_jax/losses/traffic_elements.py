@@ -11,12 +11,11 @@ from typing import Literal
 
 import jax
 import jax.numpy as jnp
-import optax
 from jaxtyping import Array, Float, Int
 
 from tflane_jax.errors import UserError
 from tflane_jax.limits import Fraction, PositiveOrZero
-from tflane_jax.losses.common import Terms, positives
+from tflane_jax.losses.common import Terms, focal, positives
 from tflane_jax.losses.costs import focal_cost, generalised_iou, pairwise_l1
 from tflane_jax.matching import Assignment, match
 from tflane_jax.scene import ElementPrediction, Example, TrafficElements
@@ -116,12 +115,11 @@ def element_terms(
     config: ElementLossConfig,
 ) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
     """Return the unweighted sums of class, L1 and generalised-IoU losses of one layer of one example."""
-    focal = partial(optax.losses.sigmoid_focal_loss, alpha=config.alpha, gamma=config.gamma)
     queries = prediction.logits.shape[0]
     # Index `queries` lies outside, so unmatched targets write nowhere.
     query = jnp.where(assignment.matched, assignment.query, queries)
     label = jnp.zeros(prediction.logits.shape).at[query, elements.attribute].set(1.0, mode="drop")
-    class_loss = focal(prediction.logits, label).sum()
+    class_loss = focal(prediction.logits, label, config.alpha, config.gamma).sum()
 
     chosen = prediction.box[assignment.query]  # (N, 2, 2)
     error = jnp.abs(_fractions(chosen, size) - _fractions(elements.box, size)).sum(-1)

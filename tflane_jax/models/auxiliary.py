@@ -5,12 +5,11 @@ from __future__ import annotations
 from typing import Any, Literal
 
 import flax.linen as nn
-import jax
-import jax.numpy as jnp
 from flax import struct
 from flax.traverse_util import flatten_dict
 from jaxtyping import Array, Float
 
+from tflane_jax.layers.initial import uniform_by_fan_in
 from tflane_jax.scene import CenterlinePrediction, LinePrediction, SegmentPrediction
 
 AUXILIARY = "auxiliary"
@@ -33,7 +32,7 @@ AuxiliaryName = Literal[
 
 @struct.dataclass
 class LaneProposalOutputs:
-    """What `losses.lane_proposals` reads.
+    """Heat map and shapes of lane proposals.
 
     Attributes:
         heat: (h, w, K) logits: is there the middle of a lane in this cell, with a heading in this bin?
@@ -94,12 +93,6 @@ class LineMaskHead(nn.Module):
     def __call__(self, features: Float[Array, "*v h w c"]) -> Float[Array, "*v h w"]:
         """Return the logit of each cell."""
         channels = features.shape[-1]
-        hidden, out = _uniform(9 * channels), _uniform(channels)
+        hidden, out = uniform_by_fan_in(9 * channels), uniform_by_fan_in(channels)
         x = nn.relu(nn.Conv(channels, (3, 3), use_bias=False, kernel_init=hidden, name="hidden")(features))
         return nn.Conv(1, (1, 1), kernel_init=out, bias_init=out, name="out")(x)[..., 0]
-
-
-def _uniform(fan_in: int) -> nn.initializers.Initializer:
-    """Return PyTorch's default of kernels and biases: uniform within 1 / sqrt(fan in)."""
-    limit = fan_in**-0.5
-    return lambda key, shape, dtype=jnp.float32: jax.random.uniform(key, shape, dtype, -limit, limit)

@@ -59,9 +59,9 @@ class BevFormerDetrConfig(HostConfig):
         return (*lane_auxiliary(self.decoder, self.denoising), *super().auxiliary)
 
     @property
-    def example_points(self) -> dict[str, int]:
-        """Lanes are compared point by point; control points are fitted to points that stand as those of a curve."""
-        return {"lane_points": self.decoder.points}
+    def example_points(self) -> dict[str, tuple[int, str]]:
+        """Lanes are compared point by point; control points are fitted to points at equal steps of the parameter."""
+        return {"lane_points": (self.decoder.points, "as many as it predicts for a lane (task.model.decoder.points)")}
 
     def build(self) -> BevFormerDetr:
         """Return the Linen module; raises UserError where its parts do not fit together."""

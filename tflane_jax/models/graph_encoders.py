@@ -290,7 +290,7 @@ class HeterogeneousAttention(nn.Module):
     """Attention within the neighbourhoods of each meta-path, and attention over the meta-paths.
 
     A composed meta-path is the product of its edges' attention matrices, as the GTN composes: its rows sum to 1, and
-    no product is formed. HAN's one softmax over all nodes that a path reaches is the same for a single edge.
+    no product is formed. HAN takes one softmax over all end nodes of a path; for paths of one edge both are equal.
     """
 
     config: HanEncoderConfig

@@ -91,8 +91,8 @@ class HostConfig:
         return ("lane_cells",) if self.encoder.cells else ()
 
     @property
-    def example_points(self) -> dict[str, int]:
-        """Required numbers of points: from the dotted name of a setting of `ExampleConfig` to the number."""
+    def example_points(self) -> dict[str, tuple[int, str]]:
+        """Required numbers of points: from the dotted name of a setting of `ExampleConfig` to (number, reason)."""
         return {}
 
     @property

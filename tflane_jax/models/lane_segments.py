@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from tflane_jax.geometry import PerceptionRange
+from tflane_jax.layers.initial import uniform_by_fan_in
 from tflane_jax.limits import Count, Limit, Rules, at_least
 from tflane_jax.models.lane_decoder import clipped, directions, refined_points, smooth_basis
 from tflane_jax.models.lane_queries import LaneDecoderConfig
@@ -64,7 +65,7 @@ class SegmentOutput(NamedTuple):
     Attributes:
         points, left, right: (Q, P, 3) metres.
         unit: `points` in [0, 1].
-        logits: (Q, 2) of the classes.
+        logits: (Q, classes).
         left_type, right_type: (Q, 3) logits of the line types.
         mask: (Q, H, W) logits of the segment's area; None outside training.
     """
@@ -166,14 +167,9 @@ class Branch(nn.Module):
     def __call__(self, x: Float[Array, "*b c"]) -> Float[Array, "*b d"]:
         """Return the last layer's output, without activation."""
         for i, width in enumerate(self.widths):
-            limit = 1.0 / math.sqrt(x.shape[-1])
-            last = i == len(self.widths) - 1
-            bias = nn.initializers.constant(self.bias) if last and self.bias is not None else _uniform(limit)
-            x = nn.Dense(width, kernel_init=_uniform(limit), bias_init=bias, name=f"linear_{i}")(x)
+            init, last = uniform_by_fan_in(x.shape[-1]), i == len(self.widths) - 1
+            bias = nn.initializers.constant(self.bias) if last and self.bias is not None else init
+            x = nn.Dense(width, kernel_init=init, bias_init=bias, name=f"linear_{i}")(x)
             if not last:
                 x = nn.relu(nn.LayerNorm(epsilon=1e-5, name=f"norm_{i}")(x) if self.norm else x)
         return x
-
-
-def _uniform(limit: float):
-    return lambda key, shape, dtype=jnp.float32: jax.random.uniform(key, shape, dtype, -limit, limit)

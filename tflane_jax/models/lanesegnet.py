@@ -83,10 +83,17 @@ class LaneSegNetConfig(HostConfig):
         return (*lane_auxiliary(self.decoder, self.denoising), *super().auxiliary)
 
     @property
-    def example_points(self) -> dict[str, int]:
+    def example_points(self) -> dict[str, tuple[int, str]]:
         """Segments and areas are compared point by point; a crossing that is a segment has two sides."""
-        areas = 2 * self.decoder.points if self.areas is None else self.areas.points
-        return {"segment_points": self.decoder.points, "area_points": areas}
+        points = self.decoder.points
+        if self.areas is None:
+            areas = 2 * points, f"two sides of a crossing with {points} points each (task.model.decoder.points)"
+        else:
+            areas = self.areas.points, "as many as it predicts for an area (task.model.areas.points)"
+        return {
+            "segment_points": (points, "as many as it predicts for a segment (task.model.decoder.points)"),
+            "area_points": areas,
+        }
 
     @property
     def example_forms(self) -> dict[str, tuple[str, str]]:

@@ -86,9 +86,10 @@ class MapTrConfig(HostConfig):
         return (*(() if self.denoising is None else ("denoised",)), *super().auxiliary)
 
     @property
-    def example_points(self) -> dict[str, int]:
+    def example_points(self) -> dict[str, tuple[int, str]]:
         """Lines are compared point by point."""
-        return {"map_lines.points": self.decoder.points}
+        predicted = self.decoder.points, "as many as it predicts for a line (task.model.decoder.points)"
+        return {"map_lines.points": predicted}
 
     @property
     def example_forms(self) -> dict[str, tuple[str, str]]:

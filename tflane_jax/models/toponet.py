@@ -63,9 +63,9 @@ class TopoNetConfig(HostConfig):
         return (*lane_auxiliary(self.decoder, self.denoising), *super().auxiliary)
 
     @property
-    def example_points(self) -> dict[str, int]:
+    def example_points(self) -> dict[str, tuple[int, str]]:
         """Lanes are compared point by point."""
-        return {"lane_points": self.decoder.points}
+        return {"lane_points": (self.decoder.points, "as many as it predicts for a lane (task.model.decoder.points)")}
 
     def build(self) -> TopoNet:
         """Return the Linen module; raises UserError where encoder, decoder and elements do not fit together."""

@@ -1,7 +1,8 @@
 """Lanes of markers as a BEV raster: which lanes pass each cell, how, and how far they are trusted.
 
 Ours, not in the marker paper; no parameters. A token of Eq. (3) is a whole lane, and every cell that attends to it gets
-the same value, so that a cell has to learn from the token where the lane passes. The raster says it.
+the same value, so that a cell has to learn from the token where the lane passes. The raster gives
+each cell the lane's place and direction.
 """
 
 from __future__ import annotations

@@ -20,8 +20,8 @@ from tflane_jax.scene import Example
 def check_settings_fit(model: HostConfig, config: ExampleConfig, *, image_scale: float | None) -> None:
     """Raise UserError where data and model cannot fit together whatever the examples are.
 
-    Ranges, points or forms of the truth differ, or the scale of the images, or the data lack the camera images, the
-    evidence, the past frames, the prior or its points that the model reads, or the lines of a map that it learns.
+    Checked are what the model reads (camera images and their scale, evidence, past frames, priors) and what it learns
+    (ranges, numbers of points, forms of the truth, the lines of a map).
 
     Args:
         model: the host.
@@ -175,11 +175,10 @@ def _check_marker_points(model: HostConfig, config: ExampleConfig) -> None:
 
 
 def _check_points(model: HostConfig, config: ExampleConfig) -> None:
-    for name, points in model.example_points.items():
+    for name, (points, why) in model.example_points.items():
         if (found := attrgetter(name)(config)) != points:
             raise UserError(
-                f"the truth of this model needs data.example.{name}={points}, as many points a lane as it predicts "
-                f"(task.model.decoder.points), not {found}: change either"
+                f"the truth of this model needs data.example.{name}={points}, {why}, not {found}: change either"
             )
 
 

@@ -31,8 +31,8 @@ _FINE_WIDTHS = (1.0, 0.85, 0.7, 0.55)
 # The value from which a whole photo is taken without a search (TuSimple's ten frames at hand have 0.23 up), and the
 # ranks from which a view is taken without a warning, and taken at all.
 _SURE, _PLAUSIBLE, _LEAST = 0.2, 0.15, 0.05
-# By how much a photo may be wider or narrower than TuSimple's 16:9 and still be seen whole without a search: 4:3 and
-# 21:9 are, squares and portraits are not, in which all lanes are distorted.
+# Largest ratio between a photo's aspect and TuSimple's 16:9 at which the whole photo may be taken without a search: 4:3
+# and 21:9 pass; in squares and portraits all lanes would be distorted.
 _ALIKE = 1.5
 _POINTS = 100
 _EMPTY = "the photo is empty: it has one brightness almost everywhere"
@@ -86,7 +86,9 @@ class PhotoReader:
         self.task, self.params, self.threshold = task, params, threshold
 
     def read(self, photo: UInt8[np.ndarray, "h w 3"], camera: PhotoCamera | None = None) -> PhotoLanes:
-        """Return the lanes of a photo; unless the horizon is known, its view is searched, for a known focal length too.
+        """Return the lanes of a photo.
+
+        The view is searched unless the camera's horizon is known; a known focal length narrows the search.
 
         Raises UserError for a camera that does not fit the photo.
         """

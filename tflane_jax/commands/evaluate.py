@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 from pathlib import Path
 from typing import Any
@@ -96,10 +97,11 @@ def _save_errors(run: Run, task: Any, source: Any, stem: Path, meta: dict[str, A
     for seed, params in zip(run.config.training.seeds, run.params, strict=True):
         with showing(True), stage("counting errors of lanes"):
             errors = lane_errors(task, params, arrays, run.config.evaluation.batch_size)
+        confidence = errors.threshold if math.isfinite(errors.threshold) else None  # no detection finds a lane
         for name, counts in (("true lanes", errors.lanes), ("detections", errors.detections)):
             every = sum(counts.values())
             fractions = {fate: 100.0 * number / every if every else 0.0 for fate, number in counts.items()}
-            rows.append({"of": name, "seed": seed, "number": every, "confidence": errors.threshold} | fractions)
+            rows.append({"of": name, "seed": seed, "number": every, "confidence": confidence} | fractions)
     title = "why lanes are not found, percent; detections with at least the confidence of the best F-score"
     print(f"\n{format_table(rows, title=title)}")
     return [*save_table(stem.with_name(f"{stem.name}-errors"), rows, meta, title=title)]

@@ -19,6 +19,7 @@ from tflane_jax.metrics.segment_matching import (
     AREA_THRESHOLDS,
     AreaTruth,
     SegmentDetections,
+    match_segments,
 )
 
 CASES = list(expected_cases("lanesegment"))
@@ -151,6 +152,28 @@ def test_groups_share_the_segments_of_all(partition):
         rest.update(detections, truth)
     merged = other.merge(rest).compute()
     assert all(merged[group] == pytest.approx(result[group]) for group in result)
+
+
+@pytest.mark.parametrize(("scores", "precision"), [([0.9, 0.8, 0.7, 0.6], 1.0), ([0.6, 0.8, 0.7, 0.9], 0.5)])
+def test_a_false_positive_belongs_to_the_group_of_its_nearest_segment_however_far(scores, precision):
+    detections, truth = frame([-20.0, 20.0], [-20.0, 27.0, 60.0, -45.0], scores)
+    assert match_segments(detections, truth, nearest="all").segments.nearest.tolist() == [0, 1, 1, 0]
+    metrics = GroupedSegmentMetrics(partition=ByDistance(), lane_groups=("right",))
+    metrics.update(detections, truth, members={"right": np.array([True, False])})
+    result = metrics.compute()["right"]
+    assert (result["lanes"], result["AP_ls"]) == (1, pytest.approx(precision))  # the last detection is its own
+
+
+def test_the_nearest_of_all_changes_no_official_number():
+    rng = np.random.default_rng(6)
+    for _ in range(5):
+        detections, truth = random_segments(rng)
+        close, every = (match_segments(detections, truth, nearest=nearest) for nearest in ("close", "all"))
+        matched = close.hits.any(0)
+        np.testing.assert_array_equal(close.hits, every.hits)
+        np.testing.assert_array_equal(close.distance, every.distance)
+        np.testing.assert_array_equal(close.segments.nearest[matched], every.segments.nearest[matched])
+        assert not matched.all()
 
 
 def test_errors_of_a_group_are_those_of_its_segments():

@@ -124,7 +124,7 @@ class LaneGraphMetrics:
             # Elements govern segments, or the centerlines on which segments lie.
             own = true is None or len(true.lane) == len(example.segments.valid)
             segments = segment_truth(example.segments, example.areas, true, None if own else example.lanes)
-            frame = match_segments(detections_of_segments(prediction.segments, found), segments)
+            frame = match_segments(detections_of_segments(prediction.segments, found), segments, nearest="all")
             self._segments.add(frame, segments.lanes, frame_group, members.get("segments"))
             self._devkit.add(frame)
         if prediction.lines is not None:

@@ -195,7 +195,7 @@ class GroupedSegmentMetrics(GroupedMetrics[MatchedSegments]):
 
         Raises UserError for arrays that do not fit together, or a visibility that is not known.
         """
-        self.add(match_segments(detections, truth), truth.lanes, frame_group, members)
+        self.add(match_segments(detections, truth, nearest="all"), truth.lanes, frame_group, members)
 
     def compute(self) -> dict[str, dict[str, float]]:
         """Return the numbers of each group."""

@@ -8,6 +8,7 @@ definition; docs/metrics.md gives the one used here.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -21,6 +22,9 @@ from tflane_jax.metrics.matching import greedy_match, nearest_truth
 
 AREA_THRESHOLDS = (0.5, 1.0, 1.5)  # metres, Chamfer
 CROSSING, BOUNDARY = 1, 2
+Nearest = Literal["close", "all"]
+# Beyond the thresholds, the nearest segment is found by so many points on each line, among so many segments.
+_COARSE, _CANDIDATES = 4, 8
 
 
 @dataclass(frozen=True)
@@ -133,19 +137,24 @@ class MatchedSegments:
         return MatchedSegments(self.segments.select(lanes), MatchedAreas.none(), self.distance[owned], wrong)
 
 
-def match_segments(detections: SegmentDetections, truth: SegmentTruth) -> MatchedSegments:
-    """Match the segments, areas and traffic elements of one frame; raise UserError for arrays that do not fit."""
+def match_segments(
+    detections: SegmentDetections, truth: SegmentTruth, *, nearest: Nearest = "close"
+) -> MatchedSegments:
+    """Match the segments, areas and traffic elements of one frame; raise UserError for arrays that do not fit.
+
+    Groups of segments need the `nearest` segment of "all" detections, see `nearest_segments`.
+    """
     true = [truth.lanes.points, truth.left, truth.right]
     found = [detections.lanes.points, detections.left, detections.right]
-    distance, nearest = nearest_segments(true, found)
-    matched = match_lanes(detections.lanes, truth.lanes, distance, nearest)
+    distance, owner = nearest_segments(true, found, nearest=nearest)
+    matched = match_lanes(detections.lanes, truth.lanes, distance, owner)
     pairs = np.flatnonzero(matched.hits.any(0))
     error = np.zeros(len(distance))
     for lines, others in zip(true, found, strict=True):
         a, b = PaddedLines.of(lines, "truth").open_ends(), PaddedLines.of(others, "detections")
-        error[pairs] += pair_chamfer(a, b, nearest[pairs], pairs) / 3.0
+        error[pairs] += pair_chamfer(a, b, owner[pairs], pairs) / 3.0
     areas = match_areas(detections.areas, truth.areas)
-    return MatchedSegments(matched, areas, error, _wrong_types(detections, truth, nearest, pairs))
+    return MatchedSegments(matched, areas, error, _wrong_types(detections, truth, owner, pairs))
 
 
 def _wrong_types(
@@ -184,7 +193,7 @@ def match_areas(detections: AreaDetections, truth: AreaTruth) -> MatchedAreas:
 
 
 def nearest_segments(
-    truth: list[Lines], detected: list[Lines]
+    truth: list[Lines], detected: list[Lines], *, nearest: Nearest = "close"
 ) -> tuple[Float[np.ndarray, " p"], Int[np.ndarray, " p"]]:
     """Return for each detection the distance to its nearest true segment (metres) and the index of that segment.
 
@@ -195,6 +204,8 @@ def nearest_segments(
     Args:
         truth: G centerlines, left lines, right lines.
         detected: P of each.
+        nearest: of detections that are 3 m or more from every segment: "close" leaves the index arbitrary, "all" finds
+            it by the same distance of a few points on each line, without the bound on centerlines.
     """
     true, found = (
         [PaddedLines.of(lines, f"{side}: {name}") for lines, name in zip(three, _NAMES, strict=True)]
@@ -215,7 +226,29 @@ def nearest_segments(
     total = pair_frechet(true_centers, centers, lane, detection) + left + right
     distance = np.full((len(true[0]), len(found[0])), np.inf)
     distance[lane, detection] = np.where(relax[lane] * center < LANE_THRESHOLDS[-1], relax[lane] * 0.5 * total, np.inf)
-    return nearest_truth(distance)
+    least, owner = nearest_truth(distance)
+    far = np.flatnonzero(least >= LANE_THRESHOLDS[-1])
+    if nearest == "all" and len(far) and len(relax):
+        owner[far] = _nearest_of_all(relax, true, [lines.select(far) for lines in found])
+    return least, owner
+
+
+def _nearest_of_all(
+    relax: Float[np.ndarray, " g"], true: list[PaddedLines], found: list[PaddedLines]
+) -> Int[np.ndarray, " p"]:
+    """Return the nearest true segment of every detection, however far, by a few points on each line.
+
+    Compared are the few segments whose centerline is nearest point by point.
+    """
+    (center, *sides), (other, *others) = ([lines.resampled(_COARSE) for lines in three] for three in (true, found))
+    apart = np.linalg.norm(center.points[:, None] - other.points, axis=-1).mean(-1)
+    near = np.argsort(relax[:, None] * apart, axis=0, kind="stable")[:_CANDIDATES]
+    i, j = near.ravel(), np.indices(near.shape)[1].ravel()
+    total = pair_frechet(center.points, other.points, i, j)
+    for a, b in zip(sides, others, strict=True):
+        total += pair_chamfer(a, b, i, j)
+    best = nearest_truth((relax[i] * total).reshape(near.shape))[1]
+    return near[best, np.arange(near.shape[1])]
 
 
 _NAMES = ("centerlines", "left lines", "right lines")

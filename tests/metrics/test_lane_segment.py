@@ -200,7 +200,7 @@ def test_mismatched_shapes_are_named():
     with pytest.raises(UserError, match="detections: 1 centerlines, 0 left lines, 1 right lines"):
         evaluate([(dataclasses.replace(detections, left=[]), truth)])
     areas = AreaTruth([np.zeros((2, 3))], np.array([3]))
-    with pytest.raises(UserError, match="truth: area categories must be 1"):
+    with pytest.raises(UserError, match="truth: area categories must be whole numbers from 1 to 2"):
         evaluate([(detections, dataclasses.replace(truth, areas=areas))])
     with pytest.raises(UserError, match="cannot merge"):
         LaneSegmentMetrics().merge(LaneSegmentMetrics("LaneSegNet"))

@@ -40,6 +40,12 @@ def test_a_detection_is_matched_with_its_nearest_truth_only():
     np.testing.assert_array_equal(taken, [-1, 0, -1])
 
 
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint64, bool, np.int8, np.float32])
+def test_scores_of_any_type_are_ranked(dtype):
+    np.testing.assert_array_equal(descending(np.array([0, 1, 0, 1], dtype)), [1, 3, 0, 2])
+    assert average_precision_11(np.array([100, 0], np.uint8), np.array([True, False]), 1) == 1.0
+
+
 def test_descending_is_stable():
     np.testing.assert_array_equal(descending(np.array([0.5, 1.0, 0.5, 1.0] * 8))[:16], np.arange(32)[1::2])
 

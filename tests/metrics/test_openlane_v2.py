@@ -281,6 +281,20 @@ def broken(**changes):
     return dataclasses.replace(detections, **changes), truth
 
 
+def broken_truth(**changes):
+    detections, truth = hand_frame()
+    return detections, dataclasses.replace(truth, **changes)
+
+
+def broken_elements(side, **changes):
+    """Change arrays of the elements of detections (0) or truth (1), each by a function of the array."""
+    frame = list(hand_frame())
+    elements = frame[side].elements
+    new = {name: change(np.asarray(getattr(elements, name), float)) for name, change in changes.items()}
+    frame[side] = dataclasses.replace(frame[side], elements=dataclasses.replace(elements, **new))
+    return frame
+
+
 @pytest.mark.parametrize(
     ("frame", "message"),
     [
@@ -290,11 +304,21 @@ def broken(**changes):
         (broken(scores=np.zeros(3)), r"scores has shape \(3,\), expected \(4,\)"),
         (broken(scores=np.array([0.1, np.nan, 0.2, 0.3])), "scores holds a number that is not finite"),
         (broken(successor=np.zeros((4, 3))), "detections: successor has shape"),
+        (broken(successor=np.full((4, 4), 7.0)), "detections: successor has confidences outside 0 to 1: apply the sig"),
+        (broken(successor=np.full((4, 4), -0.1)), "detections: successor has confidences outside 0 to 1"),
+        (broken_truth(successor=np.full((3, 3), np.nan)), "truth: successor holds a number that is not finite"),
+        (broken_truth(visibility=np.array([0.1, np.nan, 0.2])), "truth: visibility holds a number that is not finite"),
+        (
+            broken_elements(0, lane=lambda lane: 5.0 + lane),
+            "detections: lane to element has confidences outside 0 to 1",
+        ),
+        (broken_elements(1, lane=lambda lane: np.nan * lane), "truth: lane to element holds a number that is not fin"),
+        (broken_elements(0, attributes=lambda a: a + 0.5), "detections: element attributes must be whole numbers from"),
     ],
 )
 def test_arrays_that_do_not_fit(frame, message):
     with pytest.raises(UserError, match=message):
-        evaluate([frame])
+        evaluate([frame], GroupedCenterlineMetrics())
 
 
 def test_misuse_is_named():

@@ -236,7 +236,8 @@ def test_empty_input():
         ({"points": [np.array([[0, np.inf], [0, 1]])]}, "detections: line 0 has a coordinate that is not finite"),
         ({"scores": np.array([0.1, 0.2])}, r"detections: scores has shape \(2,\), expected \(1,\)"),
         ({"scores": np.array([np.nan])}, "detections: scores holds a number that is not finite"),
-        ({"classes": np.array([4])}, "detections: classes must lie between 0 and 3"),
+        ({"classes": np.array([4])}, "detections: classes must be whole numbers from 0 to 3"),
+        ({"classes": np.array([0.9])}, "detections: classes must be whole numbers from 0 to 3"),
     ],
 )
 def test_arrays_that_do_not_fit(changes, message):

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from tflane_jax.errors import UserError
 from tflane_jax.files.openlane import ATTRIBUTES
 from tflane_jax.metrics.frames import (
     ElementDetections,
@@ -19,7 +18,10 @@ from tflane_jax.metrics.frames import (
     LaneDetections,
     LaneTruth,
     check_shape,
+    checked_confidence,
+    checked_edges,
     checked_lines,
+    checked_numbers,
 )
 from tflane_jax.metrics.frechet import end_distance, pair_frechet
 from tflane_jax.metrics.matching import greedy_match, nearest_truth
@@ -144,11 +146,10 @@ def match_lanes(
 ) -> MatchedFrame:
     """Match one frame whose detections are at `distance` from their `nearest` lanes; see `match_frame`."""
     g, p = len(truth.points), len(detections.points)
-    edges, confidence = np.asarray(truth.successor, bool), np.asarray(detections.successor)
+    edges = checked_edges(truth.successor, (g, g), "truth: successor")
+    confidence = checked_confidence(detections.successor, (p, p), "detections: successor")
     scores = np.array(detections.scores)  # a copy, because the accumulator keeps it
-    check_shape(edges, (g, g), "truth: successor")
     check_shape(scores, (p,), "detections: scores")
-    check_shape(confidence, (p, p), "detections: successor")
 
     taken = np.stack([greedy_match(distance < threshold, nearest, scores) for threshold in LANE_THRESHOLDS])
     levels: dict[Version, Int[np.ndarray, "k levels p"]] = {
@@ -173,15 +174,15 @@ def _match_elements(
 ) -> MatchedElements:
     """Match the traffic elements of a frame whose lanes are matched; `lane_levels` by version, -1 for no lane."""
     t, u, p = len(truth.boxes), len(detections.boxes), next(iter(lane_levels.values())).shape[-1]
-    edges, confidence = np.asarray(truth.lane, bool), np.asarray(detections.lane)
+    edges = checked_edges(truth.lane, (lanes, t), "truth: lane to element")
+    confidence = checked_confidence(detections.lane, (p, u), "detections: lane to element")
     scores = np.array(detections.scores)  # a copy, because the accumulator keeps it
     check_shape(np.asarray(truth.boxes), (t, 2, 2), "truth: element boxes")
-    check_shape(edges, (lanes, t), "truth: lane to element")
     check_shape(np.asarray(detections.boxes), (u, 2, 2), "detections: element boxes")
     check_shape(scores, (u,), "detections: element scores")
-    check_shape(confidence, (p, u), "detections: lane to element")
-    true_attributes = _checked_attributes(truth.attributes, t, "truth")
-    attributes = _checked_attributes(detections.attributes, u, "detections")
+    possible = (0, ATTRIBUTES - 1)
+    true_attributes = checked_numbers(truth.attributes, t, possible, "truth: element attributes")
+    attributes = checked_numbers(detections.attributes, u, possible, "detections: element attributes")
 
     distance = iou_distance(truth.boxes, detections.boxes)
     inside = np.where(true_attributes[:, None] == attributes, distance, np.inf)
@@ -206,11 +207,3 @@ def _match_elements(
         topology=topology,
         vertices=vertices,
     )
-
-
-def _checked_attributes(attributes: Int[np.ndarray, " n"], count: int, what: str) -> Int[np.ndarray, " n"]:
-    attributes = np.array(attributes, np.int64)
-    check_shape(attributes, (count,), f"{what}: element attributes")
-    if ((attributes < 0) | (attributes >= ATTRIBUTES)).any():
-        raise UserError(f"{what}: element attributes must lie between 0 and {ATTRIBUTES - 1}")
-    return attributes

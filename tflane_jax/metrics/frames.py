@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -15,6 +16,8 @@ from jaxtyping import Bool, Float, Int
 from tflane_jax.errors import UserError
 from tflane_jax.geometry.distances import pad_lines
 
+# By which a confidence may miss 0 to 1, such as the sum of a softmax.
+_ROUNDING = 1e-6
 Lines = Sequence[Float[np.ndarray, "_ d"]] | Float[np.ndarray, "l n d"]
 
 
@@ -105,3 +108,33 @@ def check_shape(array: np.ndarray, shape: tuple[int, ...], what: str) -> None:
         raise UserError(f"{what} has shape {array.shape}, expected {shape}")
     if not np.isfinite(array).all():
         raise UserError(f"{what} holds a number that is not finite")
+
+
+def checked_edges(edges: Any, shape: tuple[int, ...], what: str) -> Bool[np.ndarray, "a b"]:
+    """Return true relations as flags; raise UserError for another shape or a number that is not finite."""
+    edges = np.asarray(edges)
+    check_shape(edges, shape, what)
+    return edges.astype(bool)
+
+
+def checked_confidence(confidence: Any, shape: tuple[int, ...], what: str) -> Float[np.ndarray, "a b"]:
+    """Return confidences of relations; raise UserError for another shape or numbers outside 0 to 1, such as logits."""
+    confidence = np.asarray(confidence)
+    check_shape(confidence, shape, what)
+    if ((confidence < -_ROUNDING) | (confidence > 1 + _ROUNDING)).any():
+        raise UserError(f"{what} has confidences outside 0 to 1: apply the sigmoid to logits first")
+    return confidence
+
+
+def checked_numbers(numbers: Any, count: int, limits: tuple[int, int], what: str) -> Int[np.ndarray, " n"]:
+    """Return the numbers of classes as integers of an array of their own.
+
+    Raises UserError for another shape, numbers that are not whole, or outside the limits (both included).
+    """
+    numbers = np.asarray(numbers)
+    check_shape(numbers, (count,), what)
+    whole = numbers.astype(np.int64)
+    low, high = limits
+    if (whole != numbers).any() or ((whole < low) | (whole > high)).any():
+        raise UserError(f"{what} must be whole numbers from {low} to {high}")
+    return whole

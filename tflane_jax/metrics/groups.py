@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from tflane_jax.errors import UserError
-from tflane_jax.metrics.frames import Lines
+from tflane_jax.metrics.frames import Lines, check_shape
 from tflane_jax.metrics.merging import joined
 from tflane_jax.metrics.resampling import Weights
 
@@ -124,8 +124,7 @@ class ByOcclusion:
         if truth.visibility is None:
             raise UserError("the truth has no visibility of its lanes: leave out the groups by occlusion")
         visibility = np.asarray(truth.visibility)
-        if visibility.shape != (len(truth.points),):
-            raise UserError(f"truth: visibility has shape {visibility.shape}, expected {(len(truth.points),)}")
+        check_shape(visibility, (len(truth.points),), "truth: visibility")
         return (visibility < self.below) == (group == "occluded")
 
 

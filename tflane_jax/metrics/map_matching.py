@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 from tflane_jax.errors import UserError
 from tflane_jax.metrics.buffers import buffers_touch
 from tflane_jax.metrics.chamfer import PaddedLines, near_pairs, pair_chamfer
-from tflane_jax.metrics.frames import Lines, check_shape
+from tflane_jax.metrics.frames import Lines, check_shape, checked_numbers
 from tflane_jax.metrics.map_overlap import OVERLAP_DISTANCES, map_overlap
 from tflane_jax.metrics.matching import greedy_match, nearest_truth
 
@@ -128,13 +128,14 @@ def match_map(
             finds it by the Chamfer distance of every `_COARSE`-th vertex.
     """
     true = PaddedLines.of(truth.points, "truth", dims)
-    true_classes = _checked_classes(truth.classes, len(true), "truth")
+    possible = (0, len(LINE_CLASSES) - 1)
+    true_classes = checked_numbers(truth.classes, len(true), possible, "truth: classes")
     if (true.counts < 2).any():
         raise UserError(f"truth: line {int((true.counts < 2).argmax())} has a single point")
     if truth.sampled and (true.counts != SAMPLES).any():
         raise UserError(f"truth: sampled lines have {SAMPLES} points, not {int(true.counts.min())}")
     found = PaddedLines.of(detections.points, "detections", dims)
-    classes = _checked_classes(detections.classes, len(found), "detections")
+    classes = checked_numbers(detections.classes, len(found), possible, "detections: classes")
     scores = np.asarray(detections.scores)
     check_shape(scores, (len(found),), "detections: scores")
     lines = found.counts >= 2
@@ -196,11 +197,3 @@ def _sampled(lines: PaddedLines, sampling: Sampling) -> PaddedLines:
         kept = (lines.counts == SAMPLES)[:, None, None]
         return PaddedLines(np.where(kept, lines.points[:, :SAMPLES], resampled.points), resampled.counts)
     return resampled
-
-
-def _checked_classes(classes: Int[np.ndarray, " n"], count: int, what: str) -> Int[np.ndarray, " n"]:
-    classes = np.asarray(classes, np.int64)
-    check_shape(classes, (count,), f"{what}: classes")
-    if ((classes < 0) | (classes >= len(LINE_CLASSES))).any():
-        raise UserError(f"{what}: classes must lie between 0 and {len(LINE_CLASSES) - 1}")
-    return classes

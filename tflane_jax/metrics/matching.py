@@ -12,6 +12,9 @@ from jaxtyping import Bool, Float, Int
 
 def descending(values: Float[np.ndarray, "*b n"]) -> Int[np.ndarray, "*b n"]:
     """Return the stable order of the last axis from the highest to the lowest value."""
+    values = np.asarray(values)
+    if values.dtype.kind in "ub":  # the negative of an unsigned number is none
+        values = values.astype(np.float64)
     return np.argsort(-values, axis=-1, kind="stable")
 
 

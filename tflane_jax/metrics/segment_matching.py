@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 from tflane_jax.errors import UserError
 from tflane_jax.metrics.centerline_matching import LANE_THRESHOLDS, MatchedFrame, match_lanes, relaxation
 from tflane_jax.metrics.chamfer import PaddedLines, near_pairs, pair_chamfer
-from tflane_jax.metrics.frames import LaneDetections, LaneTruth, Lines, check_shape
+from tflane_jax.metrics.frames import LaneDetections, LaneTruth, Lines, check_shape, checked_numbers
 from tflane_jax.metrics.frechet import end_distance, pair_frechet
 from tflane_jax.metrics.matching import greedy_match, nearest_truth
 
@@ -179,8 +179,9 @@ def match_areas(detections: AreaDetections, truth: AreaTruth) -> MatchedAreas:
     Only areas of the same category are compared. Only true areas lose their closing vertex.
     """
     true, found = PaddedLines.of(truth.points, "truth: areas"), PaddedLines.of(detections.points, "detections: areas")
-    true_categories = _checked_categories(truth.categories, len(true), "truth")
-    categories = _checked_categories(detections.categories, len(found), "detections")
+    possible = (CROSSING, BOUNDARY)
+    true_categories = checked_numbers(truth.categories, len(true), possible, "truth: area categories")
+    categories = checked_numbers(detections.categories, len(found), possible, "detections: area categories")
     scores = np.array(detections.scores)  # a copy, because the accumulator keeps it
     check_shape(scores, (len(found),), "detections: area scores")
     true = true.open_ends()
@@ -252,11 +253,3 @@ def _nearest_of_all(
 
 
 _NAMES = ("centerlines", "left lines", "right lines")
-
-
-def _checked_categories(categories: Int[np.ndarray, " a"], count: int, side: str) -> Int[np.ndarray, " a"]:
-    categories = np.array(categories, np.int64)
-    check_shape(categories, (count,), f"{side}: area categories")
-    if ((categories != CROSSING) & (categories != BOUNDARY)).any():
-        raise UserError(f"{side}: area categories must be {CROSSING} (crossing) or {BOUNDARY} (boundary)")
-    return categories

@@ -230,7 +230,7 @@ def test_edge_weights_are_checked(path):
             load_lstr(path, replace(TINY, encoder=GTN), edge_weight=weight)
     with pytest.raises(UserError, match=r"w.npz: .*selects no edge types"):
         load_weights(path, LaneShapeTask(TINY), edge_weight=0.5)
-    with pytest.raises(UserError, match=r"w.npz: an edge weight is of GTN encoders"):
+    with pytest.raises(UserError, match=r"w.npz: an edge weight applies to GTN encoders only"):
         load_weights(path, LaneGraphTask(TopoNetConfig()), edge_weight=0.5)
     with pytest.raises(UserError, match=r"w.npz: published weights are those of models with cameras"):
         load_weights(path, LaneGraphTask(TopoNetConfig()))

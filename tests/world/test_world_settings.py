@@ -12,7 +12,9 @@ from tflane_jax.world.front_view.traffic import FrontTrafficConfig
 from tflane_jax.world.front_view.views import FrontWorldConfig
 from tflane_jax.world.presets import CITY
 from tflane_jax.world.render.camera import FrontCameraConfig
+from tflane_jax.world.render.weather import FrontWeatherConfig, Sky
 from tflane_jax.world.roads.config import RoadConfig, SceneKind
+from tflane_jax.world.roads.markers import PlacementConfig
 from tflane_jax.world.roads.networks import build_road_network
 from tflane_jax.world.simulate import WorldConfig
 from tflane_jax.world.terrain import TerrainConfig
@@ -42,6 +44,8 @@ from tflane_jax.world.traffic.simulation import TrafficConfig
         (HighwayConfig(two_way=7.0), "two_way"),
         (FrontTrafficConfig(categories=(0.0, 0.0, 0.0, 0.0)), "categories"),
         (FrontTrafficConfig(empty=3.0), "empty"),
+        (FrontWeatherConfig(kinds=((Sky.RAIN, 1.0), (Sky.FOG, 1.0))), "kinds"),
+        (PlacementConfig(dictionary=500), "dictionary"),
         (FrontCameraConfig(width=0), "width"),
         (FrontCameraConfig(focal=(0.0, 0.0)), "focal"),
         (FrontCameraConfig(above_ground=(0.0, 0.0)), "above_ground"),

@@ -30,7 +30,7 @@ def load_weights(
     if isinstance(task, LaneShapeTask):
         return load_lstr(path, task.model, missing, 1.0 if edge_weight is None else edge_weight)
     if edge_weight is not None:
-        raise UserError(f"{path}: an edge weight is of GTN encoders, and a {type(task.model).__name__} has none")
+        raise UserError(f"{path}: an edge weight applies to GTN encoders only, not to a {type(task.model).__name__}")
     if not isinstance(task.model, PublishedHost):
         raise UserError(f"{path}: no published weights are known for a {type(task.model).__name__}")
     return load_host(path, task.model, missing)

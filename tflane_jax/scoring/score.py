@@ -61,6 +61,8 @@ class Scored:
     ) -> dict[str, tuple[float, float]]:
         """Return percentile bootstrap intervals of the numbers: scenes are drawn with replacement, `samples` times.
 
+        A number that some samples do not have, such as an error of matched lanes where none is matched, has none.
+
         Raises UserError for fewer than two scenes.
         """
         scenes = list(self.scenes.values())
@@ -72,7 +74,8 @@ class Scored:
             for name, value in _merged(chosen).compute().items():
                 drawn.setdefault(name, []).append(value)
         tails = (1 - level) / 2, (1 + level) / 2
-        return {name: tuple(np.quantile(values, tails).tolist()) for name, values in drawn.items()}
+        whole = {name: values for name, values in drawn.items() if len(values) == samples}
+        return {name: tuple(np.quantile(values, tails).tolist()) for name, values in whole.items()}
 
 
 def score(

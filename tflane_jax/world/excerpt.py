@@ -34,8 +34,8 @@ def excerpt(
 ) -> Traffic:
     """Return consecutive frames of a drive, while the vehicle is on its route.
 
-    One of the frames in which it is on a connector falls after the history, or little before or after the excerpt. Of a
-    drive without such a frame, the first part is returned.
+    A random frame on a connector is placed between 20 % before the first key frame and 20 % after the end, in units of
+    the time between the two. Of a drive without such a frame, the first part is returned.
 
     Args:
         rng: stream.

@@ -26,7 +26,7 @@ _ATTRIBUTE = np.array([0, 1, 2, 3, 4, 6, 5, 8, 7, 9, 10, 12, 11])
 
 
 def mirrored(log: Log) -> Log:
-    """Return a level drive seen in a mirror. Twice is once: every number has its old value again.
+    """Return a level drive seen in a mirror. Applied twice it gives the drive back (yaws of buildings up to rounding).
 
     Its name, weather and random numbers of rendering stay. Traffic lights keep their states, signs of left turns show
     right turns, and patterns of markers stay readable.

@@ -1,9 +1,9 @@
 """Fixed worlds: `CITY` and `STREET`, on which models are compared; `HILLS`; `REAL_LIKE`, close to recorded logs;
 `REAL_MAPS`, for recorded maps.
 
-All hold enough of a drive for a history of 10 s (20 frames at 2 Hz) before every key frame, and traffic as dense and
-as mixed as in real logs (docs/world.md compares them). They differ in their roads. `WorldData.city` and
-`WorldData.street` add the ranges and capacities of the examples.
+All hold enough of a drive for a history of 10 s (20 frames at 2 Hz) before every key frame, and about as many road
+users as real logs (docs/world.md compares them; bicycles are rarer). `CITY` and `STREET` differ in their roads alone.
+`WorldData.city` and `WorldData.street` add the ranges and capacities of the examples.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """A scene of the built-in world from its number: roads, traffic, tracker -> `Log`.
 
 Random draws come from streams `np.random.default_rng([ROOT, scene id, stream])`: a scene is the same on any machine,
-and a change of one part (for example the tracker) does not change the others.
+up to the last bit of sine and cosine, and a change of one part (for example the tracker) does not change the others.
 """
 
 from __future__ import annotations

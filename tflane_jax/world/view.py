@@ -1,7 +1,7 @@
 """A drive in which the vehicle's frame does not point where the vehicle drives.
 
 Roads run along the x axis of a vehicle that drives straight on. A model trained on such frames alone meets roads at
-other angles only at junctions; with turned frames, all angles are equally frequent.
+other angles only at junctions; turned frames add angles of up to `view_turn` on every road.
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ from typing import Annotated
 import numpy as np
 from jaxtyping import Float
 
-from tflane_jax.limits import SOME_WEIGHT, PositiveOrZero, Range
+from tflane_jax.limits import SOME_WEIGHT, PositiveOrZero, Range, Rules
 
 Rgb = Float[np.ndarray, "3"]
 
@@ -31,7 +31,7 @@ class FrontWeatherConfig:
     """Frequency and strength of each kind of weather at severity 1.
 
     Attributes:
-        kinds: relative frequencies at severity 1; at severity 0 all is clear.
+        kinds: relative frequencies at severity 1; at severity 0 all is clear, so that this kind is among them.
         fog: visibility in fog, metres (distance at which contrast has fallen to 1/e).
         rain: the same in rain.
         noise: standard deviation of the sensor noise at severity 1, of full brightness 1; night doubles it.
@@ -57,6 +57,11 @@ class FrontWeatherConfig:
     contrast: PositiveOrZero = 0.35
     exposure: PositiveOrZero = 0.35
     tint: PositiveOrZero = 0.1
+
+    def limits(self) -> Rules:
+        """Clear weather is among the kinds."""
+        has = any(kind is Sky.CLEAR for kind, _ in self.kinds)
+        yield "kinds", has, "a list with Sky.CLEAR, the weather at severity 0 (its frequency may be 0)"
 
 
 @dataclass(frozen=True)

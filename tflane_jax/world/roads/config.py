@@ -104,12 +104,13 @@ class RoadConfig:
         driveways: mean number on 100 m of kerb, where there is room for them.
         driveway_width, driveway_depth: of a driveway; the depth is counted from the kerb.
         access_share: fraction of the driveways that are access roads, with a lane in and one out: the map cuts the
-            lanes of the street there as at a junction, though its traffic passes. Each scene has its own, as far below
-            the mean or above it as leaves it between 0 and 1.
+            lanes of the street there as at a junction, though its traffic passes. Drawn for each scene, uniform
+            within min(access_share, 1 - access_share) of it.
         access_width: of an access road.
         access_rounding: radius of the kerbs at its corners.
-        cut_setback: how far from a stop line, or from the rounded corner of an access road, the map cuts lanes: mean of
-            an exponential distribution, drawn for each direction of a street; of scenes, from 0 to twice this.
+        cut_setback: how far from a stop line, or from the rounded corner of an access road, the map cuts lanes: each
+            direction of a street draws from an exponential distribution, whose mean is drawn for each scene, uniform
+            from 0 to twice this.
         car_parks: mean number of rows of parked vehicles behind the sidewalk on 100 m of kerb, where there is room.
         turn_restriction: probability that an arm must not turn left.
         sidewalk: distance of the walking line behind the kerb.

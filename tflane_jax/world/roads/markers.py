@@ -8,13 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from tflane_jax.geometry import pose_matrix
-from tflane_jax.limits import Count, Positive, PositiveOrZero
+from tflane_jax.limits import Positive, PositiveOrZero, within
 from tflane_jax.scene.logs import LaneSegment, PlacedMarkers, VectorMap
 
 ROOT = 20_251_122
@@ -58,7 +58,7 @@ class PlacementConfig:
     setback: PositiveOrZero = 0.8
     toe_in: PositiveOrZero = 5.0
     jitter: PositiveOrZero = 3.0
-    dictionary: Count = 100
+    dictionary: Annotated[int, within(1, 100)] = 100
     site: Literal["junction", "clear"] = "junction"
 
 

@@ -80,7 +80,8 @@ class RoadNetwork:
         ego_routes: sequences of segment ids that the ego vehicle may drive, each at least 120 m long; its perception
             range (+-51.2 m x +-25.6 m) stays inside the map all along.
         kind: the central feature; None on a recorded map.
-        lanes: what vehicles drive where these are not the map's own segments; every other id is one of theirs.
+        lanes: lanes that vehicles drive, if the map cuts them differently; None: the map's segments. The ids in
+            `speed_limit`, `yield_to`, `signal_phase` and `ego_routes` are theirs.
         junctions: intersections that share the vehicles which enter the map.
         drive: where examples may be made, on a recorded map; None on a network that is complete around every route.
     """

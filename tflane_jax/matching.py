@@ -40,14 +40,14 @@ class Assignment:
 
 
 def match(
-    cost: Float[Array, "*b q n"], valid: Bool[Array, "*b n"], backend: Literal["scipy", "jax"] = "jax"
+    cost: Float[Array, "*b q n"], valid: Bool[Array, "*#b n"], backend: Literal["scipy", "jax"] = "jax"
 ) -> Assignment:
     """Return the assignment of minimum total cost between queries and valid targets; no gradient flows.
 
     Args:
         cost: cost of matching query q with target n; ignored for invalid targets. Costs are clipped to +-1e6 and NaN
             counts as 1e6, so that a diverging model fails at the loss and not here.
-        valid: False for padding.
+        valid: False for padding; its leading axes broadcast against those of the costs.
         backend: "scipy" runs on the host, "jax" on the device.
     """
     cost = lax.stop_gradient(cost).astype(jnp.float32)

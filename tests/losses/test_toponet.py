@@ -169,3 +169,15 @@ def test_quality_targets_rank_lanes_by_their_precision():
         logits = step(logits)
     np.testing.assert_allclose(jax.nn.sigmoid(logits[0, 0, :2, 0]), [1.0, 0.5], atol=0.1)
     assert float(jax.nn.sigmoid(logits[0, 0, 2, 0])) < 0.1
+
+
+@pytest.mark.parametrize("backend", ["scipy", "jax"])
+def test_no_capacity_is_no_target(backend):
+    prediction, lanes = make_case(2, (0, 0, 0))
+    points = lanes.points.shape[-2]
+    config = TopoNetLossConfig(matcher=backend)
+    full, none = (
+        jitted_loss(prediction, truth, config) for truth in (lanes, stack_examples([LaneGraph.empty(0, points)] * 3))
+    )
+    np.testing.assert_allclose(none[0], full[0], rtol=1e-6)
+    assert full[0] > 0.0

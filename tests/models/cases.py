@@ -201,3 +201,12 @@ def make_camera_example(seed: int = 0, instances: int = 9, lanes: int = 4, eleme
         traffic_elements=truth,
         cameras=CameraViews(image, size, intrinsics, np.stack([ahead, back]), np.ones(2, bool)),
     )
+
+
+def make_depth_example(seed):
+    """Return `make_camera_example` with map lines, and with depth in cells of 32 pixels."""
+    rng, example = np.random.default_rng(seed), make_camera_example(seed)
+    shape = (2, 2, 3)
+    depth = rng.uniform(1.0, 9.0, shape).astype(np.float32)
+    cameras = example.cameras.replace(depth=depth, depth_valid=rng.random(shape) < 0.7)
+    return example.replace(cameras=cameras, map_lines=make_line_example(seed).map_lines)

@@ -8,7 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tests.models.cases import LIFTED_LINES, LINES, SMALL_LINES, make_camera_example, make_line_example
+from tests.models.cases import (
+    LIFTED_LINES,
+    LINES,
+    SMALL_LINES,
+    make_depth_example,
+    make_line_example,
+)
 from tests.parameters import random_params
 from tflane_jax.errors import UserError
 from tflane_jax.losses.maptrv2 import MapTrV2LossConfig
@@ -88,15 +94,6 @@ def test_it_trains_and_all_its_parameters_learn(params):
 def test_parts_that_do_not_fit_are_named():
     with pytest.raises(UserError, match=r"many is \d+: it must be 0 with denoising"):
         replace(MODEL, denoising=DenoisingConfig()).build()
-
-
-def make_depth_example(seed):
-    """Return `make_camera_example` with map lines, and with depth in cells of 32 pixels."""
-    rng, example = np.random.default_rng(seed), make_camera_example(seed)
-    shape = (2, 2, 3)
-    depth = rng.uniform(1.0, 9.0, shape).astype(np.float32)
-    cameras = example.cameras.replace(depth=depth, depth_valid=rng.random(shape) < 0.7)
-    return example.replace(cameras=cameras, map_lines=make_line_example(seed).map_lines)
 
 
 def test_masks_show_only_the_classes_that_the_model_has():

@@ -79,7 +79,7 @@ class BevGrid:
         return unit * _like(unit, (self.columns, self.rows)) - 0.5
 
 
-def _like(points: Float[ArrayT, "*b d"], values: tuple[float, ...]) -> Float[ArrayT, "*b d"]:
+def _like(points: Float[ArrayT, "*b d"], values: tuple[float, ...]) -> Float[ArrayT, "*#b d"]:
     # Of the rank of `points`: the tests run with jax_numpy_rank_promotion="raise".
     xp = namespace(points)
     return xp.asarray(values, points.dtype).reshape((1,) * (points.ndim - 1) + (len(values),))

@@ -224,9 +224,9 @@ class MultiHeadAttention(nn.Module):
     @nn.compact
     def __call__(
         self,
-        query: Float[Array, "q c"],
-        key: Float[Array, "k c"],
-        value: Float[Array, "k c"],
+        query: Float[Array, "q cq"],
+        key: Float[Array, "k ck"],
+        value: Float[Array, "k cv"],
         mask: Mask | None = None,
         *,
         deterministic: bool = True,

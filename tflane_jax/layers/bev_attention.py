@@ -127,7 +127,7 @@ class SpatialCrossAttention(nn.Module):
             found = deformable_attention(value, shapes, around, taken)
             total = jnp.zeros((queries, self.dim), found.dtype)
             total = total.at[index.reshape(-1)].add(found.reshape(-1, self.dim), mode="drop")
-        mean = total / jnp.maximum(seen.sum(0), 1)[:, None]
+        mean = total / jnp.maximum(seen.sum(0), 1)[:, None].astype(total.dtype)
         return nn.Dense(self.dim, kernel_init=_INIT, dtype=self.dtype, name="output_proj")(mean)
 
 

@@ -42,7 +42,7 @@ class FeaturePyramid(nn.Module):
     dtype: Any = None
 
     @nn.compact
-    def __call__(self, features: Sequence[Float[Array, "v h w c"]]) -> list[Float[Array, "v h w d"]]:
+    def __call__(self, features: Sequence[Float[Array, "v _h _w _c"]]) -> list[Float[Array, "v _h _w d"]]:
         """Return the levels, finest first; raises ValueError where fewer levels are wanted than stages are given."""
         levels, given = self.config.levels, len(features)
         if levels < given:

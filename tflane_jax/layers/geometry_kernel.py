@@ -82,7 +82,7 @@ class GeometryKernelAttention(nn.Module):
             found = kernel_sum(value, shapes[0], around, jnp.where(there, weights[pick], 0.0), self.kernel)
             total = jnp.zeros((queries, self.dim), found.dtype)
             total = total.at[index.reshape(-1)].add(found.reshape(-1, self.dim), mode="drop")
-        mean = total / jnp.maximum(seen.sum(0), 1)[:, None]
+        mean = total / jnp.maximum(seen.sum(0), 1)[:, None].astype(total.dtype)
         return nn.Dense(self.dim, kernel_init=_INIT, dtype=self.dtype, name="output_proj")(mean)
 
 

@@ -44,8 +44,9 @@ def image_sine_encoding(
             get huge arguments; they must be masked.
         temperature: of the frequencies 1 / temperature^(2 floor(i / 2) / bands).
     """
-    frequency = temperature ** (-2.0 * (jnp.arange(bands) // 2) / bands)
-    cosine = jnp.arange(bands) % 2 * (math.pi / 2)
+    band = jnp.arange(bands, dtype=jnp.float32)
+    frequency = temperature ** (-2.0 * (band // 2) / bands)
+    cosine = band % 2 * (math.pi / 2)
 
     def encode(counts, last):
         if normalise:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol, TypeVar
+from typing import Any, Literal, Protocol, TypeVar, runtime_checkable
 
 import flax.linen as nn
 import jax
@@ -19,6 +19,7 @@ T = TypeVar("T")
 Precision = Literal["float32", "bfloat16"]
 
 
+@runtime_checkable
 class Computation(Protocol):
     """Settings of a part.
 

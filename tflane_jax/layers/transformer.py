@@ -67,7 +67,7 @@ class FeedForward(nn.Module):
     config: TransformerConfig
 
     @nn.compact
-    def __call__(self, x: Float[Array, "n c"], *, deterministic: bool) -> Float[Array, "n c"]:
+    def __call__(self, x: Float[Array, "*b c"], *, deterministic: bool) -> Float[Array, "*b c"]:
         """Return the change of x, without the residual."""
         hidden = _ACTIVATIONS[self.config.activation](nn.Dense(self.config.hidden, name="expand")(x))
         hidden = nn.Dropout(self.config.dropout, name="dropout")(hidden, deterministic=deterministic)

@@ -63,7 +63,7 @@ def lane_cells(
     if not len(begin):
         nothing = jnp.zeros((h, w), bool)
         return LaneCells(nothing, nothing, jnp.zeros((h, w, 2)), jnp.zeros((h, w, 2)))
-    column, row = jnp.meshgrid(jnp.arange(w) + 0.5, jnp.arange(h) + 0.5)
+    column, row = jnp.meshgrid(*(jnp.arange(size, dtype=jnp.float32) + 0.5 for size in (w, h)))
 
     def compare(i: Int[Array, ""], best: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
         squared, apart, x, y, nearest = best
@@ -116,4 +116,4 @@ def lane_cell_loss(
 
 
 def _mean(values: jax.Array, where: jax.Array) -> jax.Array:
-    return jnp.where(where, values, 0.0).sum() / jnp.maximum(where.sum(), 1)
+    return jnp.where(where, values, 0.0).sum() / jnp.maximum(where.sum(dtype=values.dtype), 1)

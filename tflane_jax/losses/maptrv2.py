@@ -102,7 +102,7 @@ def mask_loss(
     every = weight * optax.losses.sigmoid_binary_cross_entropy(logits, true)
     if valid is None:
         return every.mean()
-    return jnp.where(valid, every, 0.0).sum() / jnp.maximum(valid.sum(), 1)
+    return jnp.where(valid, every, 0.0).sum() / jnp.maximum(valid.sum(dtype=every.dtype), 1)
 
 
 def depth_loss(logits: Float[Array, "*b d"], bins: Int[Array, "*b"], valid: Bool[Array, "*b"]) -> Float[Array, ""]:
@@ -113,4 +113,4 @@ def depth_loss(logits: Float[Array, "*b d"], bins: Int[Array, "*b"], valid: Bool
         bins, valid: targets, see `losses.map_masks.depth_targets`.
     """
     chosen = jnp.take_along_axis(jax.nn.log_softmax(logits, -1), bins[..., None], -1)[..., 0]
-    return -jnp.where(valid, chosen, 0.0).sum() / jnp.maximum(valid.sum(), 1)
+    return -jnp.where(valid, chosen, 0.0).sum() / jnp.maximum(valid.sum(dtype=logits.dtype), 1)

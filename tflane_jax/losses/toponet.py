@@ -275,4 +275,4 @@ def _lines(points: Float[Array, "*b p 3"], control_points: int | None) -> Float[
     if control_points is not None:
         fit = bezier_fit(points.shape[-2], control_points).astype(points.dtype)
         points = jnp.einsum("kp,...pc->...kc", fit, points)
-    return points.reshape(*points.shape[:-2], -1)
+    return points.reshape(*points.shape[:-2], points.shape[-2] * points.shape[-1])  # -1 fails without lanes

@@ -44,14 +44,14 @@ class BevFormer(nn.Module):
 
     def __call__(
         self,
-        features: Sequence[Float[Array, "v h w c"]],
+        features: Sequence[Float[Array, "v _h _w c"]],
         cameras: CameraViews,
         memory: BevMemory | None,
         previous_from_ego: Float[Array, "4 4"],
         *,
         deterministic: bool = True,
         fuse: BevHook | None = None,
-    ) -> Float[Array, "h w c"]:
+    ) -> Float[Array, "y x c"]:
         """Return the BEV features (rows, columns, C).
 
         Args:
@@ -77,7 +77,7 @@ class BevFormer(nn.Module):
     @nn.compact
     def encode(
         self,
-        features: Sequence[Float[Array, "v h w c"]],
+        features: Sequence[Float[Array, "v _h _w c"]],
         cameras: CameraViews,
         history: BevMemory,
         shift: Float[Array, "2"],
@@ -85,7 +85,7 @@ class BevFormer(nn.Module):
         *,
         deterministic: bool = True,
         fuse: BevHook | None = None,
-    ) -> Float[Array, "h w c"]:
+    ) -> Float[Array, "y x c"]:
         """Return the BEV features from an aligned memory (`align`) and the vehicle's motion (`motion_vector`)."""
         config, grid = self.config, self.config.grid
         if len(features) != config.levels or len(cameras.valid) > config.cameras:
@@ -219,7 +219,7 @@ class BevFrame:
         has_previous: () the previous frame belongs to the same sequence.
     """
 
-    features: Sequence[Float[Array, "v h w c"]]
+    features: Sequence[Float[Array, "v _h _w c"]]
     cameras: CameraViews
     previous_from_ego: Float[Array, "4 4"]
     has_previous: Bool[Array, ""]
@@ -232,7 +232,7 @@ def step(model: BevFormer, variables: Any, memory: BevMemory, frame: BevFrame) -
     return BevMemory(bev, jnp.ones((), bool)), bev
 
 
-def encode_sequence(model: BevFormer, variables: Any, frames: BevFrame) -> Float[Array, "t h w c"]:
+def encode_sequence(model: BevFormer, variables: Any, frames: BevFrame) -> Float[Array, "t y x c"]:
     """Return the BEV features of T successive frames; each frame receives the memory of the one before."""
     start = BevMemory.empty(model.config)
     return lax.scan(lambda memory, frame: step(model, variables, memory, frame), start, frames)[1]

@@ -71,7 +71,7 @@ class FrontView(NamedTuple):
         padded: (rows, columns) of the padded image array.
     """
 
-    features: Sequence[Float[Array, "h w c"]]
+    features: Sequence[Float[Array, "_h _w c"]]
     size: Int[Array, " 2"]
     padded: tuple[int, int]
 
@@ -85,7 +85,7 @@ class EncoderOutput(NamedTuple):
         memory: BEV memory for the next frame; None without cameras, or with memory off.
     """
 
-    bev: Float[Array, "h w c"]
+    bev: Float[Array, "y x c"]
     front: FrontView | None = None
     memory: BevMemory | None = None
 
@@ -119,7 +119,7 @@ class CameraEncoder(nn.Module):
         front = FrontView([level[0] for level in levels], size, padded)
         return EncoderOutput(bev, front, following)
 
-    def _bevformer(self, config, levels, example, memory, train, fuse) -> Float[Array, "h w c"]:
+    def _bevformer(self, config, levels, example, memory, train, fuse) -> Float[Array, "y x c"]:
         if memory is not None:
             # No gradient through time, as in the published code; a new scene starts without memory.
             memory = BevMemory(lax.stop_gradient(memory.features), memory.valid & example.has_previous)

@@ -96,7 +96,7 @@ class ElementDecoder(nn.Module):
     @nn.compact
     def __call__(
         self,
-        features: Sequence[Float[Array, "h w c"]],
+        features: Sequence[Float[Array, "_h _w c"]],
         size: Int[Array, " 2"],
         padded: tuple[int, int],
         *,

@@ -61,7 +61,7 @@ class ImageEncoder(nn.Module):
     config: ImageEncoderConfig
 
     @nn.compact
-    def __call__(self, cameras: CameraViews, *, train: bool = False) -> list[Float[Array, "v h w c"]]:
+    def __call__(self, cameras: CameraViews, *, train: bool = False) -> list[Float[Array, "v _h _w c"]]:
         """Return the levels (V, h, w, C), finest first.
 
         With `train`, norms use the statistics of the batch's valid views, unless they are frozen.

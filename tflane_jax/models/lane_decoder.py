@@ -14,7 +14,7 @@ Small models need "iterative" to converge.
 from __future__ import annotations
 
 from functools import partial
-from typing import Literal, NamedTuple, Protocol
+from typing import Literal, NamedTuple, Protocol, runtime_checkable
 
 import flax.linen as nn
 import jax
@@ -36,6 +36,7 @@ from tflane_jax.models.lane_queries import LaneDecoderConfig
 from tflane_jax.scene import CenterlinePrediction, ElementPrediction, Prediction
 
 
+@runtime_checkable
 class LayerSizes(Protocol):
     """Sizes of `LaneDecoderLayer`, see `LaneDecoderConfig`."""
 

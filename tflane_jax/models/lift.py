@@ -124,7 +124,7 @@ class LiftEncoder(nn.Module):
 
     def __call__(
         self,
-        levels: Sequence[Float[Array, "v h w c"]],
+        levels: Sequence[Float[Array, "v _h _w c"]],
         cameras: CameraViews,
         *,
         train: bool,
@@ -180,7 +180,7 @@ class LiftEncoder(nn.Module):
         return self.encode(features, vector, points, there, train=train, fuse=fuse)
 
 
-def _convolved(train: bool, encoder: LiftEncoder, x: Float[Array, "y x c"]) -> Float[Array, "y x c"]:
+def _convolved(train: bool, encoder: LiftEncoder, x: Float[Array, "fine_y fine_x c"]) -> Float[Array, "y x c"]:
     """Return the BEV features after the three convolutions, which are a part of the encoder."""
     for i, stride in enumerate((1, encoder.config.fine, 1)):
         conv = nn.Conv(
@@ -215,7 +215,7 @@ def ray_points(
         depth: first, last (excluded) and size of the bins, metres.
     """
     low, high, step = depth
-    d = low + step * jnp.arange(round((high - low) / step))
+    d = low + step * jnp.arange(round((high - low) / step), dtype=jnp.float32)
     v, u = (jnp.linspace(0.0, pixels - 1.0, cells) for pixels, cells in zip(size, shape, strict=True))
     d, v, u = jnp.meshgrid(d, v, u, indexing="ij")
     pixels = jnp.stack([u * d, v * d, d], -1).reshape(-1, 3)

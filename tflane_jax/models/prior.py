@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal, NamedTuple, Protocol
+from typing import Any, ClassVar, Literal, NamedTuple, Protocol, runtime_checkable
 
 import flax.linen as nn
 from jaxtyping import Array, Bool, Float
@@ -133,6 +133,7 @@ class Prior:
         return type(self).into_bev is not Prior.into_bev
 
 
+@runtime_checkable
 class PriorConfig(Protocol):
     """The configuration of a prior: a frozen dataclass."""
 

@@ -67,7 +67,7 @@ def rasterise_traffic_flow(
     heading = heading / jnp.maximum(jnp.sqrt((heading**2).sum(-1, keepdims=True)), 1e-6)
     followed = jnp.concatenate([valid[:, 1:], jnp.zeros((instances, 1), bool)], 1)
     present = valid[:, :, None] & (followed[:, :, None] | (step == 0.0)[None, None])
-    recency = (jnp.arange(frames)[:, None] + step[None] + 1.0) / frames
+    recency = (jnp.arange(frames, dtype=jnp.float32)[:, None] + step[None] + 1.0) / frames
 
     cells = grid.rows * grid.columns
     cell, offset = cells_of(unit, present, grid)

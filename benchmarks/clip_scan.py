@@ -1,9 +1,11 @@
 """Training on clips, unrolled and as a scan over time: size of the program, time to compile, loss.
 
     python -m benchmarks.clip_scan --out runs/bench                      # loss and gradient; minutes
-    python -m benchmarks.clip_scan --out runs/bench --tiny --what loss   # one decoder layer, the loss alone
+    python -m benchmarks.clip_scan --out runs/bench --tiny --what loss   # a small decoder, the loss alone
 
-Compile times are CPU seconds of this process, tracing apart. Inputs are invented numbers in the shapes of the data.
+Compile times are CPU seconds of this process, tracing apart. The clips are frames of one scene of the built-in world,
+so that cameras see the BEV cells and every frame but the first has a memory; the benchmark stops if the memory changes
+nothing. Parameters are invented.
 """
 
 from __future__ import annotations
@@ -19,7 +21,8 @@ import numpy as np
 from benchmarks.gpu.steps import invented
 from benchmarks.timing import command_line, machine, markdown_table, save
 from tflane_jax.config import load_config
-from tflane_jax.scene import shapes_of
+from tflane_jax.datasets.batches import first_example
+from tflane_jax.scene import stack_examples
 from tflane_jax.summary import shapes_of_params
 from tflane_jax.training.loop_convolutions import with_fast_convolutions
 
@@ -29,13 +32,14 @@ CLIPS = (2, 4)
 
 def measured(clip: int, form: Literal["unrolled", "scan"], what: str, *, tiny: bool) -> dict[str, Any]:
     """Return what the program of one clip takes, and its loss."""
-    config = load_config(CONFIG)
+    config: Any = load_config(CONFIG)
     task: Any = replace(config.task, clip=clip, time=form)
     if tiny:
         task = replace(task, model=replace(task.model, decoder=replace(task.model.decoder, layers=1), elements=None))
-    shapes = task.shapes(config.data)
-    params = jax.tree.map(lambda leaf: 0.1 * leaf, invented(shapes_of_params(task, shapes)))
-    batch = invented(shapes_of(shapes_of(shapes, clip), 1))
+    data = replace(config.data, train=1)
+    params = jax.tree.map(lambda leaf: 0.1 * leaf, invented(shapes_of_params(task, task.shapes(data))))
+    frames: Any = task.load(data.source("train"), progress=False)
+    batch = stack_examples([first_example(task.examples(frames))])
     of_loss = lambda *arguments: task.loss(*arguments)[0]  # noqa: E731
     function = of_loss if what == "loss" else jax.value_and_grad(of_loss)
     began = time.process_time()
@@ -45,6 +49,10 @@ def measured(clip: int, form: Literal["unrolled", "scan"], what: str, *, tiny: b
     done = time.process_time()
     found = compiled(params, batch, jax.random.key(0))
     loss = float(found if what == "loss" else found[0])
+    forgetful = batch.replace(has_previous=np.zeros_like(batch.has_previous))
+    without = compiled(params, forgetful, jax.random.key(0))
+    if loss == float(without if what == "loss" else without[0]):
+        raise RuntimeError(f"the memory changes no loss of a clip of {clip}: nothing shows that the forms keep it")
     return {
         "clip": clip,
         "form": form,
@@ -76,7 +84,7 @@ def main() -> None:
     """Parse the command line and run."""
     parser = command_line(__doc__)
     parser.add_argument("--what", choices=["gradient", "loss"], default="gradient")
-    parser.add_argument("--tiny", action="store_true", help="one decoder layer")
+    parser.add_argument("--tiny", action="store_true", help="one decoder layer, no traffic elements")
     options = parser.parse_args()
     run(options.out, options.what, tiny=options.tiny)
 

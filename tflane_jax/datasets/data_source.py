@@ -97,6 +97,8 @@ class DataSource(Generic[ConfigT]):
             made.
         check: folder -> counts and faults, for `tflane data check`; None where there is no folder to check.
         drives: config -> where its examples were recorded, area by area; None for data that show no real place.
+        recorded: whether the positions of its examples are those of a recording. A simulated drive on a real map may be
+            mirrored.
         tracks: whether tracks come from a folder of their own, which `check` takes as `tracks`.
         views: (config, numbers) -> images of these examples for pictures, where examples have none; None for an
             example whose images are not there.
@@ -119,6 +121,7 @@ class DataSource(Generic[ConfigT]):
     build: Callable[[ConfigT, bool], int] | None = None
     check: Callable[..., FolderCheck] | None = None
     drives: Callable[[ConfigT], list[Drive]] | None = None
+    recorded: bool = True
     tracks: bool = False
     views: Callable[[ConfigT, Sequence[int]], list[CameraViews | None]] | None = None
     interval: Callable[[ConfigT], float | None] = lambda config: None

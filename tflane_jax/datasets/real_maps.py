@@ -244,5 +244,6 @@ SOURCE = DataSource(
     sample=lambda config: RealMapDataset(config).example(0),
     build=lambda config, progress: len(_open(config, progress)),
     drives=_drives,
+    recorded=False,
     check=check_real_maps,
 )

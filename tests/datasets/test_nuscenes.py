@@ -226,6 +226,11 @@ def test_missing_and_strange_images_are_named(root):
     content["calibrated_sensor"][1] |= {"camera_intrinsic": K, "translation": [1.0, 1e300, 0.0]}
     with pytest.raises(UserError, match=r"row calibrated-CAM_FRONT: translation holds 1e\+300"):
         opened(write_nuscenes(root, content), image=small).example(1)
+    content = tables()
+    for row in content["sample_data"]:
+        row["filename"] = "/etc/secret.jpg"
+    with pytest.raises(UserError, match=r"filename: '/etc/secret.jpg' is not within the folder"):
+        opened(write_nuscenes(root, content), image=small).example(0)
     with pytest.raises(UserError, match=r"nuScenes has real cameras: set example\.cameras=None"):
         NuScenesDataset(NuScenesConfig(root, example=replace(SIZES, cameras=CameraRigConfig())))
 

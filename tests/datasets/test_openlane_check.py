@@ -78,6 +78,13 @@ def turn_round(content):
     front["rotation"] = [list(row) for row in zip(*front["rotation"], strict=True)]
 
 
+def name_image(name):
+    def function(content):
+        content["sensor"]["CAM_FRONT"]["image_path"] = name
+
+    return function
+
+
 def annotate(**entries):
     def function(content):
         content["annotation"] |= entries
@@ -98,6 +105,10 @@ def element(**entries):
         ("", set_rotation, "pose.rotation is no rotation"),
         ("", far, "is 1002 m from where it was"),
         ("", turn_round, "CAM_FRONT does not look ahead"),
+        ("", name_image("/etc/secret.jpg"), "'/etc/secret.jpg' is not within the folder"),
+        ("", name_image("../../secret.jpg"), "secret.jpg' is not within the folder"),
+        ("", name_image("\ud800.jpg"), r"image_path is '.ud800.jpg', expected the name of a file"),
+        ("", name_image(None), "image_path is None, expected the name of a file"),
         ("", lambda content: content.pop("pose"), "lacks the entry 'pose'"),
         ("", lambda content: content.pop("annotation"), "has no annotation"),
         ("", lambda content: content["sensor"].update(CAM_ROOF={}), "camera 'CAM_ROOF' is none of subset B"),
@@ -123,6 +134,8 @@ def test_missing_and_damaged_files_are_named(folder):
     images = sorted((folder / "train" / "01000" / "image" / "CAM_BACK").iterdir())
     images[0].unlink()
     images[1].write_bytes(images[1].read_bytes()[:-100])
+    images[2].unlink()
+    images[2].symlink_to("/dev/null")  # /dev/zero would be read until memory is full
     with open(frame(folder, 2), "w") as file:
         file.write("{")
     shutil.copy(folder / "data_dict_subset_B.json", folder / "data_dict_more.json")
@@ -132,8 +145,9 @@ def test_missing_and_damaged_files_are_named(folder):
     assert "1 of 4 train frames that split files name are missing (first train/01001/5)" in said
     assert f"{images[0]} cannot be read" in said
     assert f"{images[1]} is damaged or cut short" in said
+    assert f"{images[2]} cannot be read (it is a folder or a device)" in said
     assert "is no JSON file" in said
-    assert len(found.faults) == 4
+    assert len(found.faults) == 5
 
 
 def swap(content):

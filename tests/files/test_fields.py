@@ -5,7 +5,7 @@ import json
 import pytest
 
 from tflane_jax.errors import UserError
-from tflane_jax.files.fields import load_json, load_members
+from tflane_jax.files.fields import file_within, load_json, load_members
 
 RECORD = {"a": [1, {"b": "}"}], "pose": {"x": 1.5}, "é": None, "long": "z"}
 
@@ -39,3 +39,13 @@ def test_nothing_is_parsed_after_the_last_entry(tmp_path):
     assert load_members(path, ("pose", "a")) == {"a": RECORD["a"], "pose": RECORD["pose"]}
     with pytest.raises(UserError, match="no JSON file"):
         load_members(path, ("long",))
+
+
+@pytest.mark.parametrize("name", ["/etc/passwd", "../a.jpg", "a/../../b.jpg", "a\0.jpg", "\ud800.jpg", None, 7])
+def test_a_name_that_leads_out_of_the_folder_is_refused(tmp_path, name):
+    assert file_within(tmp_path, "a/b.jpg", "x") == tmp_path / "a" / "b.jpg"
+    with pytest.raises(
+        UserError, match=r"^here(:.* is not within the folder| is .*, expected the name of a file)"
+    ) as error:
+        file_within(tmp_path, name, "here")
+    str(error.value).encode()

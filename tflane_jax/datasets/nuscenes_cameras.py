@@ -18,7 +18,7 @@ from tflane_jax.datasets.openlane_frames import SUBSETS, FrameCamera
 from tflane_jax.datasets.plausible import MOST_PIXELS
 from tflane_jax.datasets.view_images import ImageConfig, ImageFit, fit_image
 from tflane_jax.errors import UserError
-from tflane_jax.files.fields import numbers
+from tflane_jax.files.fields import file_within, numbers
 from tflane_jax.geometry import invert_pose, relative_pose
 from tflane_jax.scene import VehicleState
 
@@ -78,12 +78,12 @@ def _camera(
     if poses == "exposure":
         pose = relative_pose(global_from_ego, tables.ego_pose(sample, name) @ pose)
     driven = float(np.linalg.norm(tables.ego_pose(sample, name)[:2, 3] - global_from_ego[:2, 3]))
+    where = tables.where("sample_data", row["token"])
     if driven > _DRIVEN:
-        where = tables.where("sample_data", row["token"])
         raise UserError(f"{where}: its ego_pose is {driven:.0f} m from that of the lidar's sweep")
     return FrameCamera(
         name=name,
-        image=tables.root / row["filename"],
+        image=file_within(tables.root, row["filename"], f"{where}: filename"),
         intrinsics=intrinsics,
         ego_from_camera=pose if frame_from_ego is None else frame_from_ego @ pose,
     )

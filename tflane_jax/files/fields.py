@@ -273,6 +273,15 @@ def is_text(value: Any) -> bool:
     return True
 
 
+def file_within(folder: Path, name: Any, where: str) -> Path:
+    """Return the file of a relative name in a folder; a name that leads out of the folder is refused."""
+    if not is_text(name) or not name.isprintable():
+        raise UserError(f"{where} is {shown(name)}, expected the name of a file")
+    if Path(name).is_absolute() or ".." in Path(name).parts:
+        raise UserError(f"{where}: {shown(name)} is not within the folder {folder}: use a relative name")
+    return folder / name
+
+
 def whole_number(value: Any, low: int, high: int, where: str) -> int:
     """Return a whole number from `low` to `high`."""
     if isinstance(value, np.ndarray) and value.ndim == 0:

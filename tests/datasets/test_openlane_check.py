@@ -322,6 +322,8 @@ class Evil:
         (other_pose, "has another pose than .*: the collection was made of other files"),
         (lambda made: next(iter(made.values())).pop("pose"), "lacks the entry 'pose'"),
         (lambda made: made.update(x=1), "'x' is no frame"),
+        (lambda made: made.update({10**5000: 1}), "an integer of many digits is no frame"),
+        (lambda made: made.update({(10**5000,): 1}), "a value of type tuple is no frame"),
         (lambda made: made.clear(), "holds no frame"),
         (lambda made: made.update(evil=Evil()), "is refused: .*print"),
     ],

@@ -5,7 +5,7 @@ import json
 import pytest
 
 from tflane_jax.errors import UserError
-from tflane_jax.files.fields import file_within, load_json, load_members
+from tflane_jax.files.fields import file_within, load_json, load_members, member, whole_number
 
 RECORD = {"a": [1, {"b": "}"}], "pose": {"x": 1.5}, "é": None, "long": "z"}
 
@@ -49,3 +49,19 @@ def test_a_name_that_leads_out_of_the_folder_is_refused(tmp_path, name):
     ) as error:
         file_within(tmp_path, name, "here")
     str(error.value).encode()
+
+
+HUGE = 10**5000  # Python refuses to write it
+
+
+@pytest.mark.parametrize(
+    ("read", "message"),
+    [
+        (lambda: whole_number(HUGE, 0, 5, "x"), "x is an integer of many digits, expected a whole number from 0 to 5"),
+        (lambda: whole_number([HUGE], 0, 5, "x"), "x is a value of type list, expected a whole number from 0 to 5"),
+        (lambda: member({HUGE: 1}, "a", "x"), "x lacks the entry 'a' (it has an integer of many digits)"),
+        (lambda: member({(HUGE,): 1}, "a", "x"), "x lacks the entry 'a' (it has a value of type tuple)"),
+    ],
+)
+def test_huge_integers_of_pickles_are_named(read, message):
+    assert told(read) == message

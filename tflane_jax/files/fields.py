@@ -116,7 +116,7 @@ def member(record: Any, name: str, where: str) -> Any:
     if not isinstance(record, Mapping):
         raise UserError(f"{where} is {_kind(record)}, expected a mapping with the entry {name!r}")
     if name not in record:
-        there = ", ".join(map(reprlib.repr, list(record)[:6]))
+        there = ", ".join(map(shown, list(record)[:6]))
         raise UserError(f"{where} lacks the entry {name!r} (it has {there or 'none'})")
     return record[name]
 
@@ -287,17 +287,21 @@ def whole_number(value: Any, low: int, high: int, where: str) -> int:
     if isinstance(value, np.ndarray) and value.ndim == 0:
         value = value.item()
     if not _is_number(value) or not low <= value <= high or value != int(value):
-        text = "an integer of many digits" if isinstance(value, int) and abs(value) >= 2**63 else reprlib.repr(value)
-        raise UserError(f"{where} is {text:.40}, expected a whole number from {low} to {high}")
+        raise UserError(f"{where} is {shown(value)}, expected a whole number from {low} to {high}")
     return int(value)
 
 
 def shown(value: Any) -> str:
-    """Return at most 40 characters of a value for a message, whatever it is."""
+    """Return at most 40 characters of a value for a message, whatever it is.
+
+    Python refuses to write integers of more than 4300 digits, alone or in a list.
+    """
+    if isinstance(value, int) and abs(value) >= 2**63:
+        return "an integer of many digits"
     try:
         return f"{reprlib.repr(value):.40}"
     except (RecursionError, ValueError):
-        return _kind(value)
+        return f"a value {_kind(value)}"
 
 
 def _at(index: tuple[int, ...]) -> str:

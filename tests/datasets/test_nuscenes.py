@@ -216,6 +216,10 @@ def test_missing_and_strange_images_are_named(root):
     content["sample_data"][4]["width"] = 32
     with pytest.raises(UserError, match="images of CAM_FRONT are 32 x 36 pixels here and 64 x 36 before"):
         opened(write_nuscenes(root, content), image=small).example(1)
+    for row in content["sample_data"]:
+        row |= {"width": 10**6, "height": 10**6}
+    with pytest.raises(UserError, match=r"images of CAM_FRONT are 1000000 x 1000000 pixels, expected 1 to 20000"):
+        opened(write_nuscenes(root, content), image=small).example(1)
     content = tables()
     content["calibrated_sensor"][1]["camera_intrinsic"] = []
     with pytest.raises(UserError, match=r"row calibrated-CAM_FRONT: camera_intrinsic has shape \(0,"):

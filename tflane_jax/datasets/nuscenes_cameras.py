@@ -15,7 +15,7 @@ from jaxtyping import Float
 from tflane_jax.datasets.nuscenes_can_bus import can_bus
 from tflane_jax.datasets.nuscenes_tables import LIDAR, Row, Tables
 from tflane_jax.datasets.openlane_frames import SUBSETS, FrameCamera
-from tflane_jax.datasets.plausible import MOST_PIXELS
+from tflane_jax.datasets.plausible import LARGEST_IMAGE, MOST_PIXELS
 from tflane_jax.datasets.view_images import ImageConfig, ImageFit, fit_image
 from tflane_jax.errors import UserError
 from tflane_jax.files.fields import file_within, numbers
@@ -139,11 +139,13 @@ def camera_fits(tables: Tables, config: ImageConfig) -> tuple[ImageFit | None, .
 
 
 def _note_size(sizes: dict[str, tuple[int, int]], name: str, row: Row, tables: Tables) -> None:
-    size = (row["width"], row["height"])
-    if sizes.setdefault(name, size) != size or min(size) < 1:
+    size, where = (row["width"], row["height"]), tables.where("sample_data", row["token"])
+    if not 1 <= min(size) <= max(size) <= LARGEST_IMAGE:
+        raise UserError(f"{where}: images of {name} are {size[0]} x {size[1]} pixels, expected 1 to {LARGEST_IMAGE}")
+    if sizes.setdefault(name, size) != size:
         raise UserError(
-            f"{tables.where('sample_data', row['token'])}: images of {name} are {size[0]} x {size[1]} pixels here and "
-            f"{sizes[name][0]} x {sizes[name][1]} before"
+            f"{where}: images of {name} are {size[0]} x {size[1]} pixels here and {sizes[name][0]} x {sizes[name][1]} "
+            "before"
         )
 
 

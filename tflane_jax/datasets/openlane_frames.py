@@ -21,7 +21,7 @@ from jaxtyping import Float
 from tflane_jax.datasets.base import SPLITS, Split
 from tflane_jax.datasets.plausible import FARTHEST, MOST_PIXELS
 from tflane_jax.errors import UserError
-from tflane_jax.files.fields import file_within, items, load_json, load_members, member, numbers
+from tflane_jax.files.fields import file_within, is_time, items, load_json, load_members, member, numbers
 from tflane_jax.files.openlane import FrameKey
 from tflane_jax.geometry import pose_matrix
 
@@ -178,7 +178,7 @@ def frames_of(content: Any, split: str, where: str) -> list[FrameKey]:
 
 
 def _time(key: FrameKey, root: Path) -> int:
-    if not key.timestamp.isdecimal():
+    if not is_time(key.timestamp):
         raise UserError(f"{root}: frame {key} has no whole number as its timestamp: leave the file out")
     return int(key.timestamp)
 

@@ -22,6 +22,8 @@ FARTHEST_STEP = 10_000.0
 """Metres from one point of a map's line to the next, or along one of its arcs; more is a damaged number."""
 FARTHEST, MOST_PIXELS = 1e8, 1e6
 """Metres of a coordinate, and pixels of a camera matrix; more would be infinite in float32, or senseless."""
+LARGEST_IMAGE = 20_000
+"""Pixels of a side of an image; arrays are made for the sizes that a calibration names."""
 # Metres from the vehicle to a box; the annotators of nuScenes saw some 150 m far.
 _UNSEEN = 500.0
 

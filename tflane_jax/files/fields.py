@@ -298,6 +298,11 @@ def is_text(value: Any) -> bool:
     return True
 
 
+def is_time(text: str) -> bool:
+    """Return whether a text is a whole number that fits in 64 bits, as a time in nanoseconds does."""
+    return text.isdecimal() and len(text) <= 19 and int(text) <= np.iinfo(np.int64).max
+
+
 def file_within(folder: Path, name: Any, where: str) -> Path:
     """Return the file of a relative name in a folder; a name that leads out of the folder is refused."""
     if not is_text(name) or not name.isprintable():

@@ -1,8 +1,8 @@
 """A segment of OpenLane-V2 as a map for the built-in world: lanes of all its frames, joined in the global frame.
 
 A frame's annotation holds the lanes within +-50 m x +-25 m of the vehicle, cut at that border, and their topology. From
-frame to frame a lane is followed by where it lies, because ids hold within a frame only; its pieces are joined, and so
-are the frames' topologies. Any folder of this form will do:
+frame to frame a lane is followed by where it lies: files of other origin may number lanes anew in every frame. Its
+pieces are joined, and so are the frames' topologies. Any folder of this form will do:
 
     <segment>/info/<timestamp>.json, or -ls.json     pose and annotation of each frame
 

@@ -1,7 +1,8 @@
 """The log of a drive: vector map, ego poses and tracks, in numpy on the host.
 
-The built-in world simulates a `Log` and the Argoverse 2 reader reads one; `tflane_jax.datasets.examples` turns
-one moment into an `Example`. Global coordinates (city frame) stay float64. Only tracks are padded, with `valid`.
+The built-in world simulates a `Log`, and the readers of Argoverse 2 and nuScenes read one;
+`tflane_jax.datasets.examples` turns one moment into an `Example`. Global coordinates (city frame) stay float64. Only
+tracks are padded, with `valid`.
 """
 
 from __future__ import annotations

@@ -73,6 +73,10 @@ def far(content):
     content["pose"]["translation"][0] += 1000.0
 
 
+def climb(content):
+    content["pose"]["translation"][2] += 1000.0
+
+
 def turn_round(content):
     front = content["sensor"]["CAM_FRONT"]["extrinsic"]
     front["rotation"] = [list(row) for row in zip(*front["rotation"], strict=True)]
@@ -103,7 +107,8 @@ def element(**entries):
     ("suffix", "function", "said"),
     [
         ("", set_rotation, "pose.rotation is no rotation"),
-        ("", far, "is 1002 m from where it was"),
+        ("", far, "is 1002 m from its place 0.5 s before: pose or timestamp is wrong"),
+        ("", climb, "is 1000 m from its place 0.5 s before"),
         ("", turn_round, "CAM_FRONT does not look ahead"),
         ("", name_image("/etc/secret.jpg"), "'/etc/secret.jpg' is not within the folder"),
         ("", name_image("../../secret.jpg"), "secret.jpg' is not within the folder"),

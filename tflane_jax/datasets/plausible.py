@@ -33,12 +33,15 @@ SHORTEST, LONGEST = 0.002, 60.0
 T = TypeVar("T")
 
 
-def check_motion(position: Float[np.ndarray, "f 2"], times_ns: Int[np.ndarray, " f"], where: Sequence[str]) -> None:
+def check_motion(position: Float[np.ndarray, "f d"], times_ns: Int[np.ndarray, " f"], where: Sequence[str]) -> None:
     """Raise UserError, which names the place, where a vehicle jumps from one key frame to the next."""
     metres, seconds = np.linalg.norm(np.diff(position, axis=0), axis=-1), np.diff(times_ns) / 1e9
     if (jumps := metres > _FASTEST * seconds + _JITTER).any():
         i = int(jumps.argmax())
-        raise UserError(f"{where[i + 1]}: the vehicle is {metres[i]:.0f} m from its place {seconds[i]:.2g} s before")
+        raise UserError(
+            f"{where[i + 1]}: the vehicle is {metres[i]:.0f} m from its place {seconds[i]:.2g} s before: pose or "
+            "timestamp is wrong"
+        )
 
 
 def check_interval(times_ns: Int[np.ndarray, " f"], unit: str, where: str) -> None:

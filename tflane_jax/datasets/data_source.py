@@ -14,7 +14,7 @@ from typing import Any, Generic, Literal, Protocol, TypeVar
 
 from tflane_jax.datasets.base import ExampleConfig, Split
 from tflane_jax.datasets.loading import load_or_stream
-from tflane_jax.datasets.overlap import Drive
+from tflane_jax.datasets.overlap import DrivenPath
 from tflane_jax.datasets.streaming import StreamingConfig
 from tflane_jax.scene import CameraViews, Example, RoadImage
 
@@ -120,7 +120,7 @@ class DataSource(Generic[ConfigT]):
     sample: Callable[[ConfigT], Any] | None = None
     build: Callable[[ConfigT, bool], int] | None = None
     check: Callable[..., FolderCheck] | None = None
-    drives: Callable[[ConfigT], list[Drive]] | None = None
+    drives: Callable[[ConfigT], list[DrivenPath]] | None = None
     recorded: bool = True
     tracks: bool = False
     views: Callable[[ConfigT, Sequence[int]], list[CameraViews | None]] | None = None

@@ -7,6 +7,7 @@ tracks are padded, with `valid`.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -108,6 +109,20 @@ class Tracks:
     occluded: np.ndarray
     valid: np.ndarray
     uuid: np.ndarray
+
+    @classmethod
+    def empty(cls, frames: int, uuid: np.ndarray | Sequence[str] = ()) -> Tracks:
+        """Return tracks without a box: one for each name, by default none."""
+        count = len(uuid)
+        return cls(
+            position=np.zeros((frames, count, 3)),
+            yaw=np.zeros((frames, count)),
+            size=np.zeros((count, 3)),
+            category=np.zeros(count, np.int32),
+            occluded=np.zeros((frames, count), bool),
+            valid=np.zeros((frames, count), bool),
+            uuid=np.array(uuid, str),
+        )
 
     @property
     def frames(self) -> int:

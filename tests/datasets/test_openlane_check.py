@@ -69,24 +69,16 @@ def set_rotation(content):
     content["pose"]["rotation"][0][0] = 2.0
 
 
-def far(content):
-    content["pose"]["translation"][0] += 1000.0
+def moved(axis):
+    def function(content):
+        content["pose"]["translation"][axis] += 1000.0
 
-
-def climb(content):
-    content["pose"]["translation"][2] += 1000.0
+    return function
 
 
 def turn_round(content):
     front = content["sensor"]["CAM_FRONT"]["extrinsic"]
     front["rotation"] = [list(row) for row in zip(*front["rotation"], strict=True)]
-
-
-def name_image(name):
-    def function(content):
-        content["sensor"]["CAM_FRONT"]["image_path"] = name
-
-    return function
 
 
 def annotate(**entries):
@@ -107,13 +99,10 @@ def element(**entries):
     ("suffix", "function", "said"),
     [
         ("", set_rotation, "pose.rotation is no rotation"),
-        ("", far, "is 1002 m from its place 0.5 s before: pose or timestamp is wrong"),
-        ("", climb, "is 1000 m from its place 0.5 s before"),
+        ("", moved(0), "is 1002 m from its place 0.5 s before: pose or timestamp is wrong"),
+        ("", moved(2), "is 1000 m from its place 0.5 s before"),
         ("", turn_round, "CAM_FRONT does not look ahead"),
-        ("", name_image("/etc/secret.jpg"), "'/etc/secret.jpg' is not within the folder"),
-        ("", name_image("../../secret.jpg"), "secret.jpg' is not within the folder"),
-        ("", name_image("\ud800.jpg"), r"image_path is '.ud800.jpg', expected the name of a file"),
-        ("", name_image(None), "image_path is None, expected the name of a file"),
+        ("", lambda content: content["sensor"]["CAM_FRONT"].update(image_path="/a.jpg"), "'/a.jpg' is not within"),
         ("", lambda content: content.pop("pose"), "lacks the entry 'pose'"),
         ("", lambda content: content.pop("annotation"), "has no annotation"),
         ("", lambda content: content["sensor"].update(CAM_ROOF={}), "camera 'CAM_ROOF' is none of subset B"),
@@ -328,7 +317,6 @@ class Evil:
         (lambda made: next(iter(made.values())).pop("pose"), "lacks the entry 'pose'"),
         (lambda made: made.update(x=1), "'x' is no frame"),
         (lambda made: made.update({10**5000: 1}), "an integer of many digits is no frame"),
-        (lambda made: made.update({(10**5000,): 1}), "a value of type tuple is no frame"),
         (lambda made: made.clear(), "holds no frame"),
         (lambda made: made.update(evil=Evil()), "is refused: .*print"),
     ],

@@ -171,19 +171,6 @@ def test_items_beyond_capacity_are_left_out_with_their_edges(whole):
     assert example.traffic_elements.lane.tolist() == [[True], [False]]
 
 
-def test_distances_are_to_lanes_and_not_to_their_vertices(folder):
-    def straight(record):
-        first, *others = record["annotation"]["lane_centerline"]
-        first["points"] = [[-60.0, 0.0, 0.0], [60.0, 0.0, 0.0]]
-        for lane in others:
-            lane["points"] = [[float(x), 20.0, 0.0] for x in range(-60, 61, 5)]
-
-    change(info(folder), straight)
-    with pytest.warns(TruncationWarning, match="more lanes"):
-        example = opened(folder, None, example=ExampleConfig(lanes=1)).example(0)
-    np.testing.assert_allclose(example.lanes.points[0, :, 1], 0.0)
-
-
 def test_a_split_without_annotations(folder):
     (folder / "train").rename(folder / "test")
     content = json.loads((folder / "data_dict_subset_B.json").read_text())

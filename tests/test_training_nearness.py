@@ -7,6 +7,7 @@ import pytest
 
 from tests.datasets.openlane_scenes import DriveConfig, DriveDataset
 from tests.datasets.test_nuscenes_scenes import content
+from tests.shared import shared_path
 from tflane_jax.config import RealMapData, RecordedData, RunConfig, WorldData
 from tflane_jax.datasets.argoverse2_log import ANNOTATIONS
 from tflane_jax.datasets.openlane_export import export_openlane_v2
@@ -27,6 +28,12 @@ def test_test_frames_are_compared_with_the_places_of_the_training_split(tmp_path
     assert training_nearness(RunConfig(data=WorldData()), test) is None
     assert training_nearness(RunConfig(data=replace(maps, generated=1.0)), test) is None
     assert training_nearness(RunConfig(data=recorded), WorldData().source("test")) is None
+
+
+def test_scenes_simulated_on_recorded_maps_are_not_compared():
+    """Half of them are mirrored, so that their positions are not those of the recorded drive on the same streets."""
+    maps = RealMapData(shared_path("data/nuscenes_scenes"), test=2)
+    assert training_nearness(RunConfig(data=maps), maps.source("test")) is None
 
 
 def test_the_training_split_may_lie_in_another_folder(tmp_path):

@@ -19,7 +19,8 @@ from tflane_jax.errors import UserError
 def training_nearness(config: RunConfig, source: Any, root: Path | None = None) -> Nearness | None:
     """Return how far the examples of a source are from the training frames of a configuration.
 
-    None where one of them shows no real place, and where no example is in a city of the training frames.
+    None where one of them shows no real place, where the examples are simulated, and where none of them is in a city
+    of the training frames.
 
     Args:
         config: of the run.
@@ -30,8 +31,8 @@ def training_nearness(config: RunConfig, source: Any, root: Path | None = None) 
     Raises UserError if the files of the training split cannot be read, or the source has no splits in a folder.
     """
     train = config.data.source("train") if root is None else _training_split(source, root)
-    drives = sources.source_of(train).drives
-    if drives is None or sources.source_of(source).drives is None:
+    drives, evaluated = sources.source_of(train).drives, sources.source_of(source)
+    if drives is None or evaluated.drives is None or not evaluated.recorded:
         return None
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", MissingTracksWarning)  # nobody looks at the traffic of these frames

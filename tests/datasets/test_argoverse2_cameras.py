@@ -136,6 +136,16 @@ def renamed(folder):
     path.rename(path.with_name("first.jpg"))
 
 
+def late(folder):
+    path = folder / "sensors" / "cameras" / FRONT / f"{980 * MS}.jpg"
+    path.rename(path.with_name(f"{2**63}.jpg"))
+
+
+def huge(folder):
+    path = folder / "calibration" / "intrinsics.feather"
+    write(path, [row | {"width_px": 20_001} for row in rows_of(path)])
+
+
 def uncalibrated(folder):
     shutil.rmtree(folder / "calibration")
 
@@ -150,6 +160,8 @@ def uncalibrated(folder):
         (far_away, r"egovehicle_SE3_sensor.feather: tx_m, ty_m, tz_m of row 0 are .*1e\+300\], no metres"),
         (no_pose, r"has no pose at the time of .*ring_front_center/980000000.jpg"),
         (renamed, r"first.jpg is not named after its time"),
+        (late, r"9223372036854775808.jpg is not named after its time"),
+        (huge, r"ring_\w+ has .* in images of 20001 x \d+ pixels, which is no camera"),
         (uncalibrated, r"intrinsics.feather is missing"),
     ],
 )

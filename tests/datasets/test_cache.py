@@ -107,7 +107,7 @@ def test_the_digest_ignores_comments_and_docstrings(other, same):
     assert (cache._code("def f(x):\n    return x + 1\n") == cache._code(other)) is same
 
 
-def test_digest_covers_the_world_and_its_imports(monkeypatch):
+def test_digest_covers_the_world_its_imports_and_the_readers_of_files(monkeypatch):
     read = []
     parse = ast.parse
 
@@ -122,6 +122,7 @@ def test_digest_covers_the_world_and_its_imports(monkeypatch):
         "scene/truth.py",
         "scene/logs.py",
         "geometry/poses.py",
+        "files/feather_table.py",
         "datasets/procedural.py",
         "world/bev/line_of_sight.py",
     )

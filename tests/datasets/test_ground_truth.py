@@ -94,6 +94,16 @@ def test_overflow_drops_the_farthest_and_counts():
     assert result.dropped == 1
 
 
+def test_distances_are_to_lines_and_not_to_their_vertices():
+    """A straight road past the vehicle has only far ends; a road beside it has a vertex every 5 m."""
+    past, beside = [(-60.0, 0.0), (60.0, 0.0)], [(x, 20.0) for x in np.arange(-60.0, 61.0, 5.0)]
+    result = crop(lane_map(segment(0, past), segment(1, beside)), capacity=1)
+    np.testing.assert_allclose(result.graph.points[0, :, 1], 0.0)
+    edges = [np.column_stack([np.array(line), np.zeros(len(line))]) for line in (past, beside)]
+    areas, _ = areas_of(boundaries=edges, capacity=1)
+    np.testing.assert_allclose(areas.points[0, :, 1], 0.0)
+
+
 def test_nothing_in_range_and_no_map_at_all():
     for vector_map in (lane_map(), lane_map(segment(0, [(90.0, 0.0), (120.0, 0.0)]))):
         result = crop(vector_map)

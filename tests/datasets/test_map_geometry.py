@@ -12,6 +12,7 @@ from tflane_jax.datasets.map_geometry import (
     lane_paths,
     merge_polygons,
 )
+from tflane_jax.errors import UserError
 from tflane_jax.geometry import PerceptionRange, invert_pose, yaw_pose
 from tflane_jax.scene import LineClass
 
@@ -196,6 +197,19 @@ def test_a_cycle_of_lanes_ends_and_gives_paths_only_from_its_entries():
     assert lane_paths({n: ring[n] for n in (0, 1)}, circle, PATCH) == []
     (path,) = lane_paths(ring, [*circle, (2, 0), (0, 3)], PATCH)
     assert path[:, :2].tolist() == [[20, 0], [5, 0], [0, 5], [-5, 0], [-20, 0]]
+
+
+def test_lanes_of_a_damaged_map_have_no_end_of_paths():
+    """Two lanes that both lead to both of the next two, 14 times: 2^14 paths; nine lanes that all follow each other."""
+    doubled = {2 * i + k: line((i, 0), (i + 0.5, k), (i + 1, 0)) for i in range(14) for k in (0, 1)}
+    merging = [(2 * i + a, 2 * i + 2 + b) for i in range(13) for a in (0, 1) for b in (0, 1)]
+    few = {number: lane for number, lane in doubled.items() if number < 10}
+    assert len(lane_paths(few, [edge for edge in merging if max(edge) < 10], PATCH)) == 2**5
+    knot = {number: line((number, 0), (number + 1, 0)) for number in range(10)}
+    tied = [(a, b) for a in range(10) for b in range(1, 10) if a != b]
+    for lanes, edges in ((doubled, merging), (knot, tied)):
+        with pytest.raises(UserError, match="fork and merge to more than 10000 paths: restore the map"):
+            lane_paths(lanes, edges, PATCH)
 
 
 def test_centerlines_are_simplified_within_their_tolerance():

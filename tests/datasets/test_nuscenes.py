@@ -216,6 +216,10 @@ def test_missing_and_strange_images_are_named(root):
     content["sample_data"][4]["width"] = 32
     with pytest.raises(UserError, match="images of CAM_FRONT are 32 x 36 pixels here and 64 x 36 before"):
         opened(write_nuscenes(root, content), image=small).example(1)
+    for row in content["sample_data"]:
+        row |= {"width": 10**6, "height": 10**6}
+    with pytest.raises(UserError, match=r"images of CAM_FRONT are 1000000 x 1000000 pixels, expected 1 to 20000"):
+        opened(write_nuscenes(root, content), image=small).example(1)
     content = tables()
     content["calibrated_sensor"][1]["camera_intrinsic"] = []
     with pytest.raises(UserError, match=r"row calibrated-CAM_FRONT: camera_intrinsic has shape \(0,"):
@@ -226,6 +230,11 @@ def test_missing_and_strange_images_are_named(root):
     content["calibrated_sensor"][1] |= {"camera_intrinsic": K, "translation": [1.0, 1e300, 0.0]}
     with pytest.raises(UserError, match=r"row calibrated-CAM_FRONT: translation holds 1e\+300"):
         opened(write_nuscenes(root, content), image=small).example(1)
+    content = tables()
+    for row in content["sample_data"]:
+        row["filename"] = "/etc/secret.jpg"
+    with pytest.raises(UserError, match=r"filename: '/etc/secret.jpg' is not within the folder"):
+        opened(write_nuscenes(root, content), image=small).example(0)
     with pytest.raises(UserError, match=r"nuScenes has real cameras: set example\.cameras=None"):
         NuScenesDataset(NuScenesConfig(root, example=replace(SIZES, cameras=CameraRigConfig())))
 

@@ -179,6 +179,14 @@ DAMAGE = {
         repeat("sample_annotation", token="again"),
         "instance car has 2 boxes in sample sample-a3",
     ),
+    "more points than 64 bits": (
+        change("sample_annotation", 1, num_lidar_pts=10**30),
+        r"row car-0: num_lidar_pts is an integer of many digits, expected a whole number",
+    ),
+    "sum of points of more than 64 bits": (
+        change("sample_annotation", 1, num_lidar_pts=2**62, num_radar_pts=2**62),
+        r"row car-0: num_lidar_pts is 4611686018427387904, expected a whole number",
+    ),
     "visibility nobody knows": (change("visibility", 3, level="v101"), "unknown visibility level 'v101'"),
 }
 

@@ -69,8 +69,11 @@ def set_rotation(content):
     content["pose"]["rotation"][0][0] = 2.0
 
 
-def far(content):
-    content["pose"]["translation"][0] += 1000.0
+def moved(axis):
+    def function(content):
+        content["pose"]["translation"][axis] += 1000.0
+
+    return function
 
 
 def turn_round(content):
@@ -96,8 +99,10 @@ def element(**entries):
     ("suffix", "function", "said"),
     [
         ("", set_rotation, "pose.rotation is no rotation"),
-        ("", far, "is 1002 m from where it was"),
+        ("", moved(0), "is 1002 m from its place 0.5 s before: pose or timestamp is wrong"),
+        ("", moved(2), "is 1000 m from its place 0.5 s before"),
         ("", turn_round, "CAM_FRONT does not look ahead"),
+        ("", lambda content: content["sensor"]["CAM_FRONT"].update(image_path="/a.jpg"), "'/a.jpg' is not within"),
         ("", lambda content: content.pop("pose"), "lacks the entry 'pose'"),
         ("", lambda content: content.pop("annotation"), "has no annotation"),
         ("", lambda content: content["sensor"].update(CAM_ROOF={}), "camera 'CAM_ROOF' is none of subset B"),
@@ -123,6 +128,8 @@ def test_missing_and_damaged_files_are_named(folder):
     images = sorted((folder / "train" / "01000" / "image" / "CAM_BACK").iterdir())
     images[0].unlink()
     images[1].write_bytes(images[1].read_bytes()[:-100])
+    images[2].unlink()
+    images[2].symlink_to("/dev/null")  # /dev/zero would be read until memory is full
     with open(frame(folder, 2), "w") as file:
         file.write("{")
     shutil.copy(folder / "data_dict_subset_B.json", folder / "data_dict_more.json")
@@ -132,8 +139,9 @@ def test_missing_and_damaged_files_are_named(folder):
     assert "1 of 4 train frames that split files name are missing (first train/01001/5)" in said
     assert f"{images[0]} cannot be read" in said
     assert f"{images[1]} is damaged or cut short" in said
+    assert f"{images[2]} cannot be read (it is a folder or a device)" in said
     assert "is no JSON file" in said
-    assert len(found.faults) == 4
+    assert len(found.faults) == 5
 
 
 def swap(content):
@@ -308,6 +316,7 @@ class Evil:
         (other_pose, "has another pose than .*: the collection was made of other files"),
         (lambda made: next(iter(made.values())).pop("pose"), "lacks the entry 'pose'"),
         (lambda made: made.update(x=1), "'x' is no frame"),
+        (lambda made: made.update({10**5000: 1}), "an integer of many digits is no frame"),
         (lambda made: made.clear(), "holds no frame"),
         (lambda made: made.update(evil=Evil()), "is refused: .*print"),
     ],

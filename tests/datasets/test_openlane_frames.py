@@ -34,3 +34,11 @@ def test_a_root_with_one_split_names_the_options_that_take_it(tmp_path, data_dic
 def test_a_folder_without_frames_is_none_of_openlane_v2(tmp_path):
     with pytest.raises(UserError, match=r"holds no val/<segment>/info/<timestamp>\.json: is it OpenLane-V2's folder"):
         list_frames(tmp_path, "val", "A")
+
+
+@pytest.mark.parametrize("name", ["first", "9" * 25])
+def test_frames_are_named_after_their_times(tmp_path, name):
+    (tmp_path / "train" / "00000" / "info").mkdir(parents=True)
+    (tmp_path / "train" / "00000" / "info" / f"{name}.json").touch()
+    with pytest.raises(UserError, match=rf"frame train/00000/{name} has no whole number as its timestamp"):
+        list_frames(tmp_path, "train", "A")

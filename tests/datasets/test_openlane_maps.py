@@ -1,6 +1,7 @@
 """A segment of OpenLane-V2 as a map: lanes cut in every frame are joined again, with their topology."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -192,3 +193,17 @@ def test_damage_is_named(root, tmp_path, damage, message):
         (info / path.name).write_text(json.dumps(frame))
     with pytest.raises(UserError, match=message):
         read_segment(segment_files(info))
+
+
+@pytest.mark.parametrize("name", [10**18, 10**16 - 1, 10**25])
+def test_times_that_do_not_fit_in_64_bits_are_named(root, tmp_path, name):
+    """The last digits of a time as nanoseconds, of one in microseconds, and of neither."""
+    info = tmp_path / "val" / "10073" / "info"
+    info.mkdir(parents=True)
+    (file,) = segment_files(root / "val/10073/info")[:1]
+    shutil.copy(file, info / f"{name}-ls.json")
+    if name == 10**18:
+        assert read_segment(segment_files(info)).map.segments
+    else:
+        with pytest.raises(UserError, match=rf"{name}-ls\.json is not named after its time in nanoseconds or microsec"):
+            read_segment(segment_files(info))

@@ -11,7 +11,7 @@ from tests.datasets.openlane_scenes import FRAMES, DriveConfig, DriveDataset
 from tests.datasets.test_openlane_lanes import seen, straight
 from tflane_jax.datasets.base import ExampleConfig
 from tflane_jax.datasets.openlane_export import export_openlane_v2
-from tflane_jax.datasets.openlane_markers import BoardsConfig, DriveFrame, SegmentBoards
+from tflane_jax.datasets.openlane_markers import BoardsConfig, SegmentBoards, SegmentFrame
 from tflane_jax.datasets.openlane_v2 import OpenLaneV2Config, OpenLaneV2Dataset, nominal_example
 from tflane_jax.datasets.view_images import TOPONET_SUBSET_B
 from tflane_jax.errors import UserError
@@ -40,7 +40,7 @@ def drive(cameras=None, places=(0.0, 5.0, 10.0, 15.0, 20.0)):
     lanes = [("a", straight(-20, 60)), ("b", straight(60, 100)), ("c", straight(60, 100, y=0.5))]
     cameras = (camera(),) if cameras is None else cameras
     return [
-        DriveFrame(10**18 + 500_000_000 * i, seen(x, lanes, edges=[(0, 1), (0, 2)]), cameras)
+        SegmentFrame(10**18 + 500_000_000 * i, seen(x, lanes, edges=[(0, 1), (0, 2)]), cameras)
         for i, x in enumerate(places)
     ]
 

@@ -10,12 +10,12 @@ from hypothesis import strategies as st
 from tests.shared import shared_root
 from tflane_jax.cli import main
 from tflane_jax.datasets.base import FrameInfo
-from tflane_jax.datasets.overlap import NEAR_GROUPS, Drive, frame_drives, nearness, overlap, read_drives
+from tflane_jax.datasets.overlap import NEAR_GROUPS, DrivenPath, frame_drives, nearness, overlap, read_drives
 from tflane_jax.errors import UserError
 
 
 def drive(name, *positions, area="PIT"):
-    return Drive(name, area, np.array(positions, float).reshape(-1, 2))
+    return DrivenPath(name, area, np.array(positions, float).reshape(-1, 2))
 
 
 def test_distances_by_hand():
@@ -93,7 +93,7 @@ def test_a_frame_without_a_city_may_be_in_any_and_the_result_says_so():
 def test_distances_equal_a_plain_loop(seed, n, m):
     rng = np.random.default_rng(seed)
     a, b = rng.uniform(-50, 50, (n, 2)), rng.uniform(-50, 50, (m, 2))
-    found = overlap([Drive("a", "PIT", a)], [Drive("b", "PIT", b)])
+    found = overlap([DrivenPath("a", "PIT", a)], [DrivenPath("b", "PIT", b)])
     np.testing.assert_allclose(found.distances[0], np.linalg.norm(a[None] - b[:, None], axis=-1).min(1), atol=1e-9)
 
 

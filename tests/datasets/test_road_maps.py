@@ -179,8 +179,16 @@ def test_the_content_tells_changed_files(tmp_path):
         one.content()
 
 
-def test_a_damaged_scene_file_is_named_and_not_passed_over(tmp_path):
-    (tmp_path / "scene-1.npz").write_bytes(b"no zip")
+def of_another_version(archive):
+    """Return an archive whose directory says that its first member needs version 9.9 of zip."""
+    head, sign, entry = archive.partition(b"PK\x01\x02")
+    return head + sign + entry[:2] + b"\x63\x00" + entry[4:]
+
+
+@pytest.mark.parametrize("damage", [lambda archive: b"no zip", of_another_version])
+def test_a_damaged_scene_file_is_named_and_not_passed_over(tmp_path, damage):
+    np.savez(file := tmp_path / "scene-1.npz", **content())
+    file.write_bytes(damage(file.read_bytes()))
     (one,) = find_maps(tmp_path)
     with pytest.raises(UserError, match=r"scene-1\.npz is no .npz file"):
         one.read()

@@ -1,11 +1,21 @@
-"""Entries of JSON files that are parsed only in part."""
+"""Entries of JSON files that are parsed only in part; names, numbers and sizes that no reader believes."""
 
 import json
 
+import numpy as np
 import pytest
 
 from tflane_jax.errors import UserError
-from tflane_jax.files.fields import load_json, load_members
+from tflane_jax.files.fields import (
+    choices,
+    file_within,
+    fractions,
+    load_json,
+    load_members,
+    member,
+    numbers,
+    whole_number,
+)
 
 RECORD = {"a": [1, {"b": "}"}], "pose": {"x": 1.5}, "é": None, "long": "z"}
 
@@ -39,3 +49,61 @@ def test_nothing_is_parsed_after_the_last_entry(tmp_path):
     assert load_members(path, ("pose", "a")) == {"a": RECORD["a"], "pose": RECORD["pose"]}
     with pytest.raises(UserError, match="no JSON file"):
         load_members(path, ("long",))
+
+
+@pytest.mark.parametrize("name", ["/etc/passwd", "../a.jpg", "a/../../b.jpg", "a\0.jpg", "\ud800.jpg", None, 7])
+def test_a_name_that_leads_out_of_the_folder_is_refused(tmp_path, name):
+    assert file_within(tmp_path, "a/b.jpg", "x") == tmp_path / "a" / "b.jpg"
+    with pytest.raises(
+        UserError, match=r"^here(:.* is not within the folder| is .*, expected the name of a file)"
+    ) as error:
+        file_within(tmp_path, name, "here")
+    str(error.value).encode()
+
+
+HUGE = 10**5000  # Python refuses to write it
+
+
+@pytest.mark.parametrize(
+    ("read", "message"),
+    [
+        (lambda: whole_number(HUGE, 0, 5, "x"), "x is an integer of many digits, expected a whole number from 0 to 5"),
+        (lambda: whole_number([HUGE], 0, 5, "x"), "x is a value of type list, expected a whole number from 0 to 5"),
+        (lambda: member({HUGE: 1}, "a", "x"), "x lacks the entry 'a' (it has an integer of many digits)"),
+        (lambda: member({(HUGE,): 1}, "a", "x"), "x lacks the entry 'a' (it has a value of type tuple)"),
+    ],
+)
+def test_huge_integers_of_pickles_are_named(read, message):
+    assert told(read) == message
+
+
+def doubled(value, times):
+    """Return lists in lists that hold a value 2^times times, in memory only once."""
+    for _ in range(times):
+        value = [value, value]
+    return value
+
+
+def cycle():
+    one = []
+    one.append(one)
+    return one
+
+
+ROWS = [[0.0] * 10_000] * 10_000
+
+
+@pytest.mark.parametrize(
+    ("read", "value"),
+    [
+        (numbers, doubled(1.0, 26)),
+        (numbers, [0.0, doubled([0.0] * 100_000, 10)]),
+        (numbers, [np.zeros(100_000)] * 1000),
+        (numbers, cycle()),
+        *((read, ROWS) for read in (numbers, choices, fractions)),
+    ],
+    ids=["doubled", "behind a number", "arrays", "cycle", *("rows" for _ in range(3))],
+)
+def test_lists_that_stand_for_too_many_numbers_are_refused(read, value):
+    with pytest.raises(UserError, match=r"^x holds more than 10000000 numbers, or lists nested more than 32 deep"):
+        read(value, (None, None), "x")

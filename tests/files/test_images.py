@@ -83,7 +83,10 @@ def test_unreadable_files_are_named(tmp_path):
         "empty.jpg": "empty.jpg is empty: copy or download",
         "text.jpg": "text.jpg is damaged or no image .*save it as JPEG or PNG",
         "cut.jpg": "cut.jpg is damaged",
-        ".": "cannot read .*: Is a directory",
+        ".": "cannot read .*: it is a folder or a device",
+        "/dev/null": "cannot read /dev/null: it is a folder or a device",
+        "zero\0.jpg": "cannot read .*: no file can have this name",
+        "half\ud800.jpg": "cannot read .*: no file can have this name",
     }.items():
         with pytest.raises(UserError, match=message):
             read_image(tmp_path / name)

@@ -80,6 +80,13 @@ def test_the_size_that_an_array_claims_is_ignored(tmp_path):
     assert load_plain_pickle(tmp_path / "huge.pkl").size == 0
 
 
+def test_the_number_that_an_object_claims_takes_no_memory(tmp_path):
+    """PROTO 4, BININT1 1, LONG_BINPUT 100,000,000, STOP: Python would make a table of 1.6 GB for it."""
+    (tmp_path / "memo.pkl").write_bytes(b"\x80\x04K\x01r" + (100_000_000).to_bytes(4, "little") + b".")
+    with pytest.raises(UserError, match=r"memo\.pkl is .* damaged .*it numbers its objects in an unknown way"):
+        load_plain_pickle(tmp_path / "memo.pkl")
+
+
 @pytest.mark.parametrize("data", [b"", b"{}", b"\x80\x04", b"PK\x03\x04 not a pickle", pickle.dumps(PLAIN)[:-40]])
 def test_a_damaged_file_is_named(tmp_path, data):
     (tmp_path / "broken.pkl").write_bytes(data)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from tflane_jax.errors import UserError
+from tflane_jax.files.atomic import is_temporary
 from tflane_jax.files.videos import VideoInfo, read_frames, sample_frames, video_info, writing_video
 
 cv2 = pytest.importorskip("cv2")
@@ -42,6 +43,14 @@ def test_an_interrupted_video_is_not_left(tmp_path):
     with pytest.raises(RuntimeError):
         interrupted()
     assert list(tmp_path.iterdir()) == []
+
+
+def test_what_a_killed_writer_leaves_is_known_as_temporary(tmp_path):
+    with writing_video(tmp_path / "drive.mp4", INFO) as writer:
+        writer.add(np.zeros((48, 64, 3), np.uint8))
+        left = list(tmp_path.iterdir())
+    assert left
+    assert all(map(is_temporary, left))
 
 
 def test_damaged_files_are_named(video, tmp_path, capfd):

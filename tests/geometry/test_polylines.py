@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
-from shapely import LineString, box
+from shapely import LineString, Point, box
 
 from tests.shared import shared_root
 from tflane_jax.geometry import PerceptionRange, pose_matrix, transform_points
-from tflane_jax.geometry.polylines import arc_length, clip_to_range, resample, sample_at
+from tflane_jax.geometry.polylines import arc_length, clip_to_range, nearest_lines, nearest_on, resample, sample_at
 
 QUICK = settings(max_examples=60, deadline=None, derandomize=True)
 RANGE = PerceptionRange((-10.0, 10.0), (-5.0, 5.0))
@@ -105,6 +105,26 @@ def test_clipping_equals_shapely(seed, points, grid):
     for end in ends:
         on_border = np.isin(end[0], RANGE.x) or np.isin(end[1], RANGE.y)
         assert on_border or tuple(end) in own
+
+
+@QUICK
+@given(seed=st.integers(0, 10**6), points=st.integers(1, 12))
+def test_the_nearest_place_on_a_line_is_that_of_shapely(seed, points):
+    line, place = random_line(seed, points, grid=False), np.random.default_rng(seed).uniform(-20, 20, 2)
+    segment, fraction, distance = nearest_on(line, place)
+    expected = Point(line[0]) if points == 1 else LineString(line[:, :2])
+    assert distance == pytest.approx(expected.distance(Point(place)))
+    there = line[segment] + fraction * (line[min(segment + 1, points - 1)] - line[segment])
+    assert np.linalg.norm(there[:2] - place) == pytest.approx(distance)
+
+
+def test_the_nearest_lines_are_those_that_pass_near():
+    lines = [np.array(points, float) for points in ([[5, 3]], [[-60, 0], [60, 0]], [[-1, 2], [0, 2], [1, 2]])]
+    assert nearest_lines(lines, 1).tolist() == [1]
+    assert nearest_lines(lines, 2).tolist() == [1, 2]
+    assert nearest_lines(lines, 1, (5.0, 3.0)).tolist() == [0]
+    assert nearest_lines(lines, 9).tolist() == [0, 1, 2]
+    assert nearest_lines([], 2).tolist() == []
 
 
 @QUICK

@@ -9,7 +9,7 @@ from tests.datasets.small_logs import lane_map, segment
 from tflane_jax.geometry import PerceptionRange, invert_pose, yaw_pose
 from tflane_jax.markers.observe import observe
 from tflane_jax.markers.simulation import SimulatedMarkers
-from tflane_jax.markers.store import MarkerStore, UnknownMarkerWarning, store_of
+from tflane_jax.markers.store import MarkerStore, StoredMarker, UnknownMarkerWarning, store_of
 from tflane_jax.scene.logs import PlacedMarkers
 from tflane_jax.world.roads.markers import marker_pose
 
@@ -83,6 +83,14 @@ def test_beyond_capacity_the_farthest_are_dropped():
     none = observe(detected, STORE, RANGE, markers=0, lanes=0, points=2)
     none.markers.validate()
     assert none.markers_dropped == 3
+
+
+def test_distances_are_to_lanes_and_not_to_their_vertices():
+    """A long lane past the marker, and a short one 20 m aside; stores of other origin may have so few points."""
+    lanes = np.array([[[-40.0, 0, 0], [40, 0, 0]], [[-5, 20, 0], [5, 20, 0]]])
+    store = MarkerStore({5: StoredMarker(5, np.eye(4), lanes, np.zeros((2, 2), bool))}, "survey")
+    found = observe(detect(np.eye(4)[None], (5,)), store, RANGE, markers=1, lanes=1, points=5)
+    np.testing.assert_allclose(found.markers.lanes[0, 0, :, 1], 0.0)
 
 
 def test_padding_and_nothing_detected():

@@ -65,6 +65,7 @@ def saved(tmp_path):
         (lambda r: r.update(frame="ego"), "frame is 'ego'"),
         (lambda r: r.update(markers={}), "markers is of type dict"),
         (lambda r: r["markers"][1].pop("id"), "markers[1] lacks the entry 'id'"),
+        (lambda r: r["markers"][1].update(lanes=[[[0, 0, 0], [1, 0, 0]]] * 1001), "lanes has 1001 entries"),
         (lambda r: r["markers"][1].update(id=1.5), "markers[1]: id is 1.5"),
         (lambda r: r["markers"][1].update(id=float("inf")), "markers[1]: id is inf"),
         (lambda r: r["markers"][1].update(id=float("nan")), "markers[1]: id is nan"),

@@ -16,7 +16,7 @@ from tflane_jax.datasets.map_geometry import BOUNDARY_MARGIN, clip_ring, shrunke
 from tflane_jax.datasets.prepared_map import PreparedMap
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import PerceptionRange
-from tflane_jax.geometry.polylines import clip_to_range, resample, resample_lines
+from tflane_jax.geometry.polylines import clip_to_range, nearest_lines, resample, resample_lines
 from tflane_jax.scene import Areas, AreaType
 
 
@@ -47,8 +47,7 @@ def crop_areas(
     boundaries = [piece for i in lines.near(inner) for piece in clip_ring(lines.line(i), inner)]
     found = rings + boundaries
     category = [AreaType.PEDESTRIAN_CROSSING] * len(rings) + [AreaType.ROAD_BOUNDARY] * len(boundaries)
-    distance = [np.linalg.norm(line[:, :2], axis=-1).min() for line in found]
-    kept = sorted(np.argsort(distance, kind="stable")[:capacity].tolist())
+    kept = nearest_lines(found, capacity)
     n, areas = len(kept), Areas.empty(capacity, points)
     if n:
         areas.points[:n] = resample_lines([found[i] for i in kept], points)

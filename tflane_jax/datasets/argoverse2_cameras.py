@@ -21,10 +21,11 @@ from jaxtyping import Float, Int
 
 from tflane_jax.datasets.argoverse2_log import POSE_COLUMNS, POSES, poses_of, read_poses
 from tflane_jax.datasets.openlane_frames import SUBSETS, FrameCamera
-from tflane_jax.datasets.plausible import MOST_PIXELS, first_twice
+from tflane_jax.datasets.plausible import LARGEST_IMAGE, MOST_PIXELS, first_twice
 from tflane_jax.datasets.view_images import ImageConfig, ImageFit, fit_image
 from tflane_jax.errors import UserError
 from tflane_jax.files.feather_table import Kind, read_columns
+from tflane_jax.files.fields import is_time
 from tflane_jax.geometry import relative_pose
 from tflane_jax.scene.logs import KeyFrame
 
@@ -143,7 +144,7 @@ def ring_fits(logs: Iterable[LogImages], config: ImageConfig) -> tuple[ImageFit 
 
 def _times(folder: Path) -> Int[np.ndarray, " n"]:
     files = sorted(folder.glob("*.jpg"))
-    if odd := [file for file in files if not file.stem.isdecimal()]:
+    if odd := [file for file in files if not is_time(file.stem)]:
         raise UserError(f"{odd[0]} is not named after its time in nanoseconds: take the file out")
     return np.sort(np.array([int(file.stem) for file in files], np.int64))
 
@@ -155,7 +156,8 @@ def _intrinsics(path: Path) -> tuple[dict[str, tuple[int, int]], dict[str, np.nd
     for row, name in enumerate(table["sensor_name"].tolist()):
         fx, fy, cx, cy = (float(table[column][row]) for column in ("fx_px", "fy_px", "cx_px", "cy_px"))
         width, height = int(table["width_px"][row]), int(table["height_px"][row])
-        if not (0.0 < fx <= MOST_PIXELS and 0.0 < fy <= MOST_PIXELS and 0.0 < cx < width and 0.0 < cy < height):
+        proper = 0.0 < fx <= MOST_PIXELS and 0.0 < fy <= MOST_PIXELS and 0.0 < cx < width and 0.0 < cy < height
+        if not proper or max(width, height) > LARGEST_IMAGE:
             raise UserError(
                 f"{path}: {name} has focal lengths {fx:g} and {fy:g} and principal point {cx:g}, {cy:g} in images of "
                 f"{width} x {height} pixels, which is no camera: download it again"

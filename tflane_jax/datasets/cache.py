@@ -41,8 +41,8 @@ _UNUSABLE = (
     *(errno.ELOOP, errno.EIO, errno.ESTALE),
 )
 
-# Packages whose code determines the examples.
-_SOURCES = ("scene", "geometry", "world", "markers", "datasets")
+# Packages whose code determines the examples; `files` reads the maps of recorded logs.
+_SOURCES = ("scene", "geometry", "files", "world", "markers", "datasets")
 # Libraries by which it draws, searches images, merges areas and finds neighbours; OpenCV has several names.
 _OPENCV = ("opencv-python", "opencv-python-headless", "opencv-contrib-python", "opencv-contrib-python-headless")
 _LIBRARIES = ("numpy", "scipy", "shapely", *_OPENCV)

@@ -14,7 +14,7 @@ from typing import Any, Generic, Literal, Protocol, TypeVar
 
 from tflane_jax.datasets.base import ExampleConfig, Split
 from tflane_jax.datasets.loading import load_or_stream
-from tflane_jax.datasets.overlap import Drive
+from tflane_jax.datasets.overlap import DrivenPath
 from tflane_jax.datasets.streaming import StreamingConfig
 from tflane_jax.scene import CameraViews, Example, RoadImage
 
@@ -97,6 +97,8 @@ class DataSource(Generic[ConfigT]):
             made.
         check: folder -> counts and faults, for `tflane data check`; None where there is no folder to check.
         drives: config -> where its examples were recorded, area by area; None for data that show no real place.
+        recorded: whether the positions of its examples are those of a recording. A simulated drive on a real map may be
+            mirrored.
         tracks: whether tracks come from a folder of their own, which `check` takes as `tracks`.
         views: (config, numbers) -> images of these examples for pictures, where examples have none; None for an
             example whose images are not there.
@@ -118,7 +120,8 @@ class DataSource(Generic[ConfigT]):
     sample: Callable[[ConfigT], Any] | None = None
     build: Callable[[ConfigT, bool], int] | None = None
     check: Callable[..., FolderCheck] | None = None
-    drives: Callable[[ConfigT], list[Drive]] | None = None
+    drives: Callable[[ConfigT], list[DrivenPath]] | None = None
+    recorded: bool = True
     tracks: bool = False
     views: Callable[[ConfigT, Sequence[int]], list[CameraViews | None]] | None = None
     interval: Callable[[ConfigT], float | None] = lambda config: None

@@ -23,7 +23,7 @@ from jaxtyping import Float, UInt8
 
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import write_json
-from tflane_jax.files.fields import items, load_json, member, numbers, shown, whole_number
+from tflane_jax.files.fields import file_within, items, load_json, member, numbers, shown, whole_number
 from tflane_jax.files.images import read_image, undistorted
 from tflane_jax.geometry import invert_pose
 from tflane_jax.scene import CameraViews
@@ -172,10 +172,8 @@ def _frame(entry: Any, names: Sequence[str], folder: Path, where: str) -> DriveF
     for name, file in listed.items():
         if name not in names:
             raise UserError(f"{where}: images names the camera {name!r:.40}, which is none of {', '.join(names)}")
-        relative = Path(_text(file, f"{where}: images: {name}"))
-        if relative.is_absolute() or ".." in relative.parts:
-            raise UserError(f"{where}: image {file!r:.80} is not within the folder of --images: use a relative name")
-        images[name] = folder / relative
+        place = f"{where}: images: {name}"
+        images[name] = file_within(folder, _text(file, place), place)
         if not images[name].is_file():
             raise UserError(f"{where}: there is no image {images[name]}: correct --images, or the file's name")
     return DriveFrame(time, _pose(entry, "global_from_ego", where), images)

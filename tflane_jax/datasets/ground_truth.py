@@ -15,7 +15,14 @@ from jaxtyping import Float, Int
 
 from tflane_jax.datasets.prepared_map import MapLanes
 from tflane_jax.geometry import PerceptionRange, transform_points
-from tflane_jax.geometry.polylines import arc_length, clip_to_range, resample_lines, sample_at
+from tflane_jax.geometry.polylines import (
+    arc_length,
+    clip_to_range,
+    nearest_lines,
+    nearest_on,
+    resample_lines,
+    sample_at,
+)
 from tflane_jax.scene import LaneGraph, TrafficElements
 from tflane_jax.scene.logs import MapElement
 from tflane_jax.world.bev.line_of_sight import hidden_points
@@ -66,8 +73,7 @@ def lane_graph(
         boxes, buildings: obstacles to the line of sight (see `hidden_points`), ego frame.
     """
     pieces = _crop(lanes, ego_from_global, range_)
-    distance = [np.linalg.norm(p.centerline[:, :2], axis=-1).min() for p in pieces]
-    kept = sorted(np.argsort(distance, kind="stable")[:capacity].tolist())
+    kept = nearest_lines([p.centerline for p in pieces], capacity)
     dropped, pieces = len(pieces) - len(kept), [pieces[i] for i in kept]
     n, graph = len(pieces), LaneGraph.empty(capacity, points)
     lane = np.array([p.lane for p in pieces], int)
@@ -140,12 +146,9 @@ def _boundary_of(part: np.ndarray, line: np.ndarray, whole: np.ndarray, range_: 
 
 def _position_along(line: np.ndarray, point: np.ndarray) -> float:
     """Return the arc length at which a line passes nearest to a point."""
-    start, step = line[:-1, :2], np.diff(line[:, :2], axis=0)
-    square = (step**2).sum(-1)
-    t = ((point[:2] - start) * step).sum(-1) / np.where(square > 0.0, square, 1.0)
-    t = np.clip(t, 0.0, 1.0)
-    nearest = np.linalg.norm(start + t[:, None] * step - point[:2], axis=-1).argmin()
-    return float(arc_length(line)[nearest] + t[nearest] * np.sqrt(square[nearest]))
+    segment, fraction, _ = nearest_on(line, point[:2])
+    step = line[segment + 1, :2] - line[segment, :2]
+    return float(arc_length(line)[segment] + fraction * np.sqrt((step**2).sum()))
 
 
 def traffic_elements(

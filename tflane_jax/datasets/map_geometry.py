@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from tflane_jax.datasets.packed_lines import PackedLines
-from tflane_jax.errors import missing_extra
+from tflane_jax.errors import UserError, missing_extra
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.geometry.polylines import clip_to_range
 from tflane_jax.geometry.rings import from_first_corner, oriented
@@ -29,6 +29,8 @@ BOUNDARY_MARGIN = 0.2
 SIMPLIFIED = 0.2
 # Metres; ends of lines that are nearer than this are one point.
 SAME_END = 0.1
+# Paths through the lanes of a patch; forks and merges in succession double them.
+_MOST_PATHS = 10_000
 
 Polygon = Sequence[Float[np.ndarray, "_ d"]]
 """A polygon: the exterior ring, then the interior ones; each repeats its first point."""
@@ -117,7 +119,7 @@ class MapGeometry:
         """Return the pieces inside a patch, in its frame: dividers, crossings, boundaries, and centerlines if wanted.
 
         Rings start at their first corner (`geometry.rings`), wherever the map has them start. Raises UserError where a
-        crossing must be cut and shapely is not installed.
+        crossing must be cut and shapely is not installed, and as `lane_paths`.
         """
         pieces = [
             MapPiece(piece, LineClass.DIVIDER, number)
@@ -271,7 +273,7 @@ def lane_paths(
 
     A lane that the border cuts into several pieces is several nodes. Two lanes are joined if their joint lies inside.
     (MapTRv2 also joins the last piece of a lane to the first piece of its successor if the joint lies outside, by a
-    straight line.) A cycle without a root gives no path.
+    straight line.) A cycle without a root gives no path. Raises UserError for more than 10,000 paths.
 
     Args:
         lanes: by number, in driving direction, frame of the patch.
@@ -293,17 +295,27 @@ def lane_paths(
         if before in last and after in first:
             following[last[before]].append(first[after])
     roots = set(following) - {node for after in following.values() for node in after}
-    paths = [path for root in sorted(roots) for path in _simple_paths([root], following)]
+    paths = _simple_paths(sorted(roots), following)
     return [_simplified(_concatenated([nodes[node] for node in path])) for path in paths]
 
 
-def _simple_paths(path: list[int], following: dict[int, list[int]]) -> Iterator[list[int]]:
-    """Yield every path to a leaf that continues this one and visits no node twice."""
-    if not following[path[-1]]:
-        yield path
-    for node in following[path[-1]]:
-        if node not in path:
-            yield from _simple_paths([*path, node], following)
+def _simple_paths(roots: Sequence[int], following: dict[int, list[int]]) -> list[list[int]]:
+    """Return every path from a root to a leaf that visits no node twice."""
+    paths: list[list[int]] = []
+    begun, tried = [[root] for root in reversed(roots)], 0
+    while begun:
+        path = begun.pop()
+        after, tried = following[path[-1]], tried + 1
+        if not after:
+            paths.append(path)
+        # Paths that come back to themselves end without a leaf.
+        if len(paths) > _MOST_PATHS or tried > 10 * _MOST_PATHS:
+            raise UserError(
+                f"the lanes around the vehicle fork and merge to more than {_MOST_PATHS} paths: restore the map, or "
+                "leave out centerlines (data.example.map_lines.centerlines = exclude)"
+            )
+        begun += [[*path, node] for node in reversed(after) if node not in path]
+    return paths
 
 
 def _concatenated(lines: Sequence[np.ndarray]) -> np.ndarray:

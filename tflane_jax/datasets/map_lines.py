@@ -10,12 +10,12 @@ from jaxtyping import Float
 
 from tflane_jax.datasets.map_geometry import MapGeometry
 from tflane_jax.geometry import PerceptionRange
-from tflane_jax.geometry.polylines import resample_lines
+from tflane_jax.geometry.polylines import nearest_lines, resample_lines
 from tflane_jax.limits import Count, at_least
 from tflane_jax.scene import LineClass, MapLines
 from tflane_jax.world.bev.line_of_sight import hidden_points
 
-# Points on each line at which distance and line of sight are measured.
+# Points on each line at which line of sight is tested.
 _SIGHT_SAMPLES = 101
 # Points at which MapTR's metric compares lines; `metrics.vector_map` asks for as many.
 DENSE_POINTS = 100
@@ -53,15 +53,13 @@ def crop_map_lines(
         boxes, buildings: obstacles to the line of sight (see `hidden_points`), ego frame.
     """
     pieces = geometry.cut(ego_from_global, range_, centerlines=config.centerlines == "include")
-    # Of the many points, not of the vertices: a straight line has only its ends.
-    sight = resample_lines([piece.points for piece in pieces], _SIGHT_SAMPLES)[..., :2]
-    distance = np.linalg.norm(sight, axis=-1).min(1)
-    kept = np.sort(np.argsort(distance, kind="stable")[: config.lines])
+    kept = nearest_lines([piece.points for piece in pieces], config.lines)
     dropped, pieces, n = len(pieces) - len(kept), [pieces[i] for i in kept], len(kept)
     lines = MapLines.empty(config.lines, config.points, DENSE_POINTS)
     if n:
-        hidden = hidden_points(sight[kept].reshape(-1, 2), boxes, buildings).reshape(n, -1)
         originals = [piece.points for piece in pieces]
+        sight = resample_lines(originals, _SIGHT_SAMPLES)[..., :2]
+        hidden = hidden_points(sight.reshape(-1, 2), boxes, buildings).reshape(n, -1)
         lines.points[:n] = resample_lines(originals, config.points)
         assert lines.dense is not None
         lines.dense[:n] = resample_lines(originals, DENSE_POINTS)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import threading
 import warnings
 import weakref
 
@@ -27,6 +28,7 @@ from tflane_jax.world.roads.markers import PlacementConfig
 # Detections in images by log, track frame and settings: key frames are also the earlier moment of later ones.
 _DETECTED: dict[tuple[int, int, CameraRigConfig, PixelConfig], DetectedMarkers] = {}
 _REMEMBERED: dict[tuple[int, float, bool], tuple[PlacedMarkers, MarkerStore]] = {}
+_LOCK = threading.Lock()
 
 
 def markers_of(log: Log) -> PlacedMarkers:
@@ -62,12 +64,13 @@ def store_of_log(
 
 
 def _remembered(log: Log, radius: float, bike_lanes: bool) -> tuple[PlacedMarkers, MarkerStore]:
-    """Return the markers of a log and their store, made once for all its frames."""
+    """Return the markers of a log and their store, made once for all its frames. Threads may call it."""
     key = (id(log), radius, bike_lanes)
-    if key not in _REMEMBERED:
-        _REMEMBERED[key] = markers_of(log), store_of_log(log, radius=radius, bike_lanes=bike_lanes)
-        weakref.finalize(log, _REMEMBERED.pop, key)
-    return _REMEMBERED[key]
+    with _LOCK:
+        if key not in _REMEMBERED:
+            _REMEMBERED[key] = markers_of(log), store_of_log(log, radius=radius, bike_lanes=bike_lanes)
+            weakref.finalize(log, _REMEMBERED.pop, key, None)
+        return _REMEMBERED[key]
 
 
 def _detected(

@@ -15,10 +15,10 @@ from jaxtyping import Float
 from tflane_jax.datasets.nuscenes_can_bus import can_bus
 from tflane_jax.datasets.nuscenes_tables import LIDAR, Row, Tables
 from tflane_jax.datasets.openlane_frames import SUBSETS, FrameCamera
-from tflane_jax.datasets.plausible import MOST_PIXELS
+from tflane_jax.datasets.plausible import LARGEST_IMAGE, MOST_PIXELS
 from tflane_jax.datasets.view_images import ImageConfig, ImageFit, fit_image
 from tflane_jax.errors import UserError
-from tflane_jax.files.fields import numbers
+from tflane_jax.files.fields import file_within, numbers
 from tflane_jax.geometry import invert_pose, relative_pose
 from tflane_jax.scene import VehicleState
 
@@ -78,12 +78,12 @@ def _camera(
     if poses == "exposure":
         pose = relative_pose(global_from_ego, tables.ego_pose(sample, name) @ pose)
     driven = float(np.linalg.norm(tables.ego_pose(sample, name)[:2, 3] - global_from_ego[:2, 3]))
+    where = tables.where("sample_data", row["token"])
     if driven > _DRIVEN:
-        where = tables.where("sample_data", row["token"])
         raise UserError(f"{where}: its ego_pose is {driven:.0f} m from that of the lidar's sweep")
     return FrameCamera(
         name=name,
-        image=tables.root / row["filename"],
+        image=file_within(tables.root, row["filename"], f"{where}: filename"),
         intrinsics=intrinsics,
         ego_from_camera=pose if frame_from_ego is None else frame_from_ego @ pose,
     )
@@ -139,11 +139,13 @@ def camera_fits(tables: Tables, config: ImageConfig) -> tuple[ImageFit | None, .
 
 
 def _note_size(sizes: dict[str, tuple[int, int]], name: str, row: Row, tables: Tables) -> None:
-    size = (row["width"], row["height"])
-    if sizes.setdefault(name, size) != size or min(size) < 1:
+    size, where = (row["width"], row["height"]), tables.where("sample_data", row["token"])
+    if not 1 <= min(size) <= max(size) <= LARGEST_IMAGE:
+        raise UserError(f"{where}: images of {name} are {size[0]} x {size[1]} pixels, expected 1 to {LARGEST_IMAGE}")
+    if sizes.setdefault(name, size) != size:
         raise UserError(
-            f"{tables.where('sample_data', row['token'])}: images of {name} are {size[0]} x {size[1]} pixels here and "
-            f"{sizes[name][0]} x {sizes[name][1]} before"
+            f"{where}: images of {name} are {size[0]} x {size[1]} pixels here and {sizes[name][0]} x {sizes[name][1]} "
+            "before"
         )
 
 

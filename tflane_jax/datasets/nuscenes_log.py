@@ -186,9 +186,9 @@ def scene_tracks(
         bad = int((size <= 0.0).any(-1).argmax())
         raise UserError(f"{where[bad]}: size {size[bad].tolist()} is not positive")
     instance, first, k = np.unique([row["instance_token"] for row in rows], return_index=True, return_inverse=True)
-    f, shape = np.array([number for number, _ in found], int), (len(frames.samples), len(instance))
+    f = np.array([number for number, _ in found], int)
     _check_once(f, k, rows, where)
-    tracks = empty_tracks(*shape, uuid=instance.astype(str))
+    tracks = Tracks.empty(len(frames.samples), instance)
     tracks.size[:] = size[first][:, [1, 0, 2]]  # the table has width, length, height
     tracks.category[:] = [_category(tables, rows[i], categories) for i in first]
     global_from_ego, frame_from_ego = frames.global_from_ego[f], frames.frame_from_ego[f]
@@ -200,20 +200,6 @@ def scene_tracks(
     tracks.occluded[f, k] = _unseen(tables, rows, where, least_visibility)
     tracks.valid[f, k] = True
     return tracks
-
-
-def empty_tracks(frames: int, count: int, uuid: np.ndarray) -> Tracks:
-    """Return tracks without a box."""
-    flag = np.zeros((frames, count), bool)
-    return Tracks(
-        position=np.zeros((frames, count, 3)),
-        yaw=np.zeros((frames, count)),
-        size=np.zeros((count, 3)),
-        category=np.zeros(count, np.int32),
-        occluded=flag,
-        valid=flag.copy(),
-        uuid=uuid,
-    )
 
 
 def road_user(category: str, where: str, categories: Mapping[str, RoadUser | None] = CATEGORIES) -> RoadUser | None:

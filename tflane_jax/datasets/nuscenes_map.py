@@ -150,7 +150,7 @@ class _MapFile:
         self.content = load_json(path)
         version = str(member(self.content, "version", str(path)))
         parts = version.split(".")
-        if not all(part.isdecimal() for part in parts) or tuple(map(int, parts)) < _FIRST_VERSION:
+        if not all(part.isdecimal() and len(part) < 10 for part in parts) or tuple(map(int, parts)) < _FIRST_VERSION:
             raise UserError(f"{path} is version {version!r:.20}, which has no arclines: download version 1.3")
         nodes = self._layer("node")
         points = [[member(row, axis, f"{path}: node {token}") for axis in ("x", "y")] for token, row in nodes.items()]

@@ -25,7 +25,7 @@ from jaxtyping import Float
 
 from tflane_jax.datasets.lane_outlines import LaneOutline, boundaries
 from tflane_jax.datasets.log_frames import LogOutline
-from tflane_jax.datasets.nuscenes_log import CATEGORIES, empty_tracks, road_user, side_of
+from tflane_jax.datasets.nuscenes_log import CATEGORIES, road_user, side_of
 from tflane_jax.datasets.nuscenes_map import flat
 from tflane_jax.datasets.plausible import LONGEST, SHORTEST, check_distance, check_motion, check_place
 from tflane_jax.errors import UserError
@@ -154,7 +154,7 @@ def _tracks(
     users = [road_user(str(name), f"{path}: category", categories) for name in content["category"]]
     kept = [i for i, user in enumerate(users) if user is not None]
     valid = content["valid"][:, kept]
-    tracks = empty_tracks(*valid.shape, uuid=content["instance_token"][kept])
+    tracks = Tracks.empty(len(valid), content["instance_token"][kept])
     tracks.valid[:] = valid
     tracks.size[:] = content["size_wlh"][kept][:, [1, 0, 2]]
     tracks.category[:] = [users[i] for i in kept]

@@ -18,7 +18,7 @@ from jaxtyping import Float
 
 from tflane_jax.datasets.plausible import FARTHEST
 from tflane_jax.errors import UserError
-from tflane_jax.files.fields import numbers
+from tflane_jax.files.fields import numbers, shown
 from tflane_jax.files.json_rows import json_rows
 from tflane_jax.geometry import matrix_from_quaternion, pose_matrix
 
@@ -69,6 +69,8 @@ _LINKS = {
 _OPTIONAL = {"prev", "next", "visibility_token"}
 _TEXT = {"prev", "next", "name", "channel", "location", "level", "filename"}
 _WHOLE = {"timestamp", "nbr_samples", "num_lidar_pts", "num_radar_pts", "width", "height"}
+# Larger numbers, and the sum of two of them, would not fit in 64 bits.
+_LARGEST = 2**62
 LIDAR = "LIDAR_TOP"
 # Largest deviation of a quaternion's norm from 1.
 _UNIT = 0.01
@@ -264,8 +266,8 @@ def _checked(row: Row, column: str, path: Path) -> Any:
     if column.endswith("_token") or column in _TEXT:
         if not isinstance(value, str):
             raise UserError(f"{path}: row {row['token']}: {column} is {value!r:.40}, expected text")
-    elif column in _WHOLE and (isinstance(value, bool) or not isinstance(value, int) or value < 0):
-        raise UserError(f"{path}: row {row['token']}: {column} is {value!r:.40}, expected a whole number")
+    elif column in _WHOLE and (isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < _LARGEST):
+        raise UserError(f"{path}: row {row['token']}: {column} is {shown(value)}, expected a whole number")
     return value
 
 

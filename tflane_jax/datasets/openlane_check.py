@@ -29,13 +29,12 @@ from tflane_jax.datasets.openlane_frames import (
     source_logs,
 )
 from tflane_jax.datasets.openlane_tracks import SourceTracks, listed
+from tflane_jax.datasets.plausible import check_motion
 from tflane_jax.errors import UserError
 from tflane_jax.files.fields import load_json, member
 from tflane_jax.files.openlane import CENTERLINE, SEGMENT, FrameKey
 from tflane_jax.progress import progress_bar
 
-# Metres per second; a higher speed between two frames means damaged poses.
-_FASTEST = 70.0
 # Frames of a segment that are read to find its subset.
 _TRIED = 3
 _FRAME_FILE = re.compile(r"(\d+)(-ls)?\.json")
@@ -274,13 +273,13 @@ def _check_motion(
     """Compare a frame with the one before it in its segment."""
     if before is None or frame is None or before[0].segment != key.segment:
         return
-    seconds = (int(key.timestamp) - int(before[0].timestamp)) * SUBSETS[subset].tick_ns / 1e9
-    metres = float(np.linalg.norm((frame.global_from_ego - before[1].global_from_ego)[:3, 3]))
-    if metres > _FASTEST * seconds:
-        yield (
-            f"{frame.path}: the vehicle is {metres:.0f} m from where it was {seconds:.2g} s before: pose or timestamp "
-            "is wrong"
-        )
+    (earlier, other), tick = before, SUBSETS[subset].tick_ns
+    places = np.stack([other.global_from_ego, frame.global_from_ego])[:, :3, 3]
+    gap = min((int(key.timestamp) - int(earlier.timestamp)) * tick, 2**62)  # fits in 64 bits
+    try:
+        check_motion(places, np.array([0, gap]), [str(other.path), str(frame.path)])
+    except UserError as error:
+        yield str(error)
 
 
 def _logs(root: Path, keys: list[FrameKey], subset: SubsetName, tracks: Path, *, alone: bool) -> SourceTracks | None:

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from tflane_jax.datasets.openlane_frames import FrameCamera, FrameFile
+from tflane_jax.files.images import unreadable
 from tflane_jax.world.cameras.ring import ARGOVERSE2_RING, NUSCENES_RING
 
 Images = Literal["ends", "whole"]
@@ -92,6 +93,8 @@ def _jpeg_size(file: IO[bytes]) -> tuple[int, int] | None:
 
 def _damage(path: Path, images: Images) -> str | None:
     """Return the fault of an image file, or None."""
+    if fault := unreadable(path):
+        return f"cannot be read ({fault})"
     try:
         with open(path, "rb") as file:
             start = file.read(4)

@@ -14,7 +14,7 @@ import numpy as np
 
 from tflane_jax.datasets.openlane_frames import info_path
 from tflane_jax.errors import UserError
-from tflane_jax.files.fields import load_json, member, numbers
+from tflane_jax.files.fields import load_json, member, numbers, shown
 from tflane_jax.files.openlane import CENTERLINE, SEGMENT, FrameKey
 from tflane_jax.files.plain_pickle import load_plain_pickle
 
@@ -44,7 +44,7 @@ def _check(root: Path, path: Path, content: Mapping[Any, Any], there: set[FrameK
     keys = []
     for name in content:
         if not (isinstance(name, tuple) and len(name) == 3 and all(isinstance(part, str) for part in name)):
-            raise UserError(f"{path}: {name!r:.60} is no frame, expected (split, segment, timestamp)")
+            raise UserError(f"{path}: {shown(name)} is no frame, expected (split, segment, timestamp)")
         keys.append(FrameKey(*name))
     absent = sorted(set(keys) - there)
     if absent:

@@ -18,7 +18,7 @@ from tflane_jax.errors import UserError
 from tflane_jax.files.images import read_image
 from tflane_jax.files.openlane import DENSE_POINTS
 from tflane_jax.geometry import invert_pose
-from tflane_jax.geometry.polylines import resample_lines
+from tflane_jax.geometry.polylines import nearest_lines, resample_lines
 from tflane_jax.scene import (
     Areas,
     CameraViews,
@@ -159,9 +159,8 @@ def element_set(
 
 def _nearest(lines: list[np.ndarray], capacity: int, name: str) -> Int[np.ndarray, " n"]:
     """Return the indices of the `capacity` lines that come nearest to the vehicle, ascending."""
-    distance = [np.linalg.norm(line[:, :2], axis=-1).min() for line in lines]
     _warn_dropped(len(lines) - capacity, name)
-    return np.sort(np.argsort(distance, kind="stable")[:capacity])
+    return nearest_lines(lines, capacity)
 
 
 def _warn_dropped(count: int, name: str) -> None:

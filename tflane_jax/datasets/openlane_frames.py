@@ -21,7 +21,7 @@ from jaxtyping import Float
 from tflane_jax.datasets.base import SPLITS, Split
 from tflane_jax.datasets.plausible import FARTHEST, MOST_PIXELS
 from tflane_jax.errors import UserError
-from tflane_jax.files.fields import items, load_json, load_members, member, numbers
+from tflane_jax.files.fields import file_within, is_time, items, load_json, load_members, member, numbers
 from tflane_jax.files.openlane import FrameKey
 from tflane_jax.geometry import pose_matrix
 
@@ -178,7 +178,7 @@ def frames_of(content: Any, split: str, where: str) -> list[FrameKey]:
 
 
 def _time(key: FrameKey, root: Path) -> int:
-    if not key.timestamp.isdecimal():
+    if not is_time(key.timestamp):
         raise UserError(f"{root}: frame {key} has no whole number as its timestamp: leave the file out")
     return int(key.timestamp)
 
@@ -256,7 +256,8 @@ def _camera(sensors: Any, name: str, root: Path, where: str) -> FrameCamera:
     if not (intrinsics[0, 0] > 0.0 and intrinsics[1, 1] > 0.0 and (intrinsics[2] == (0.0, 0.0, 1.0)).all()):
         raise UserError(f"{where}.intrinsic.K is no camera matrix (positive focal lengths, last row 0 0 1)")
     pose = frame_pose(member(sensor, "extrinsic", where), f"{where}.extrinsic")
-    return FrameCamera(name, root / str(member(sensor, "image_path", where)), intrinsics, pose)
+    image = file_within(root, member(sensor, "image_path", where), f"{where}.image_path")
+    return FrameCamera(name, image, intrinsics, pose)
 
 
 def frame_pose(record: Any, where: str) -> Float[np.ndarray, "4 4"]:

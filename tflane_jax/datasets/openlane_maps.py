@@ -1,8 +1,8 @@
 """A segment of OpenLane-V2 as a map for the built-in world: lanes of all its frames, joined in the global frame.
 
 A frame's annotation holds the lanes within +-50 m x +-25 m of the vehicle, cut at that border, and their topology. From
-frame to frame a lane is followed by where it lies, because ids hold within a frame only; its pieces are joined, and so
-are the frames' topologies. Any folder of this form will do:
+frame to frame a lane is followed by where it lies: files of other origin may number lanes anew in every frame. Its
+pieces are joined, and so are the frames' topologies. Any folder of this form will do:
 
     <segment>/info/<timestamp>.json, or -ls.json     pose and annotation of each frame
 
@@ -82,8 +82,11 @@ def read_segment(files: Sequence[Path]) -> RoadMap:
         edges.step([(transform_points(pose, line),) for line in border])
         poses.append(pose)
     places = np.stack(poses)[:, :2, 3]
-    times = np.array([_time(path) for path in files], np.int64)
-    times = times if times.max() >= _NANOSECONDS else 1000 * times
+    latest = max(files, key=_time)
+    tick = 1 if _time(latest) >= _NANOSECONDS else 1000
+    if tick * _time(latest) > np.iinfo(np.int64).max:
+        raise UserError(f"{latest} is not named after its time in nanoseconds or microseconds: take the file out")
+    times = np.array([tick * _time(path) for path in files], np.int64)
     check_motion(places, times, [str(path) for path in files])
     segments = dict(_segments(lanes, sides=files[0].stem.endswith(SEGMENT.suffix)))
     segment = files[0].parent.parent

@@ -53,7 +53,7 @@ class BoardsConfig:
 
 
 @dataclass(frozen=True)
-class DriveFrame:
+class SegmentFrame:
     """One frame of a segment.
 
     Attributes:
@@ -67,9 +67,9 @@ class DriveFrame:
     cameras: tuple[FrontCamera, ...]
 
 
-def drive_frame(
+def segment_frame(
     file: FrameFile, names: FieldNames, timestamp_ns: int, sizes: Sequence[tuple[int, int] | None]
-) -> DriveFrame:
+) -> SegmentFrame:
     """Return what a frame's file says; without an annotation there are no lanes.
 
     Args:
@@ -89,7 +89,7 @@ def drive_frame(
         for camera, size in zip(file.cameras, sizes, strict=True)
         if camera is not None and size is not None
     ]
-    return DriveFrame(timestamp_ns, lanes, tuple(cameras))
+    return SegmentFrame(timestamp_ns, lanes, tuple(cameras))
 
 
 class SegmentBoards:
@@ -109,7 +109,7 @@ class SegmentBoards:
         boards: BoardsConfig,
         config: MarkerConfig,
         range_: PerceptionRange,
-        read: Callable[[str], Sequence[DriveFrame]],
+        read: Callable[[str], Sequence[SegmentFrame]],
     ):
         if config.pixels is not None:
             raise UserError(
@@ -149,7 +149,7 @@ class SegmentBoards:
 class _Segment:
     """Boards, store and cameras of one segment."""
 
-    def __init__(self, name: str, frames: Sequence[DriveFrame], boards: BoardsConfig, radius: float):
+    def __init__(self, name: str, frames: Sequence[SegmentFrame], boards: BoardsConfig, radius: float):
         lanes = segment_lanes([frame.lanes for frame in frames], boards.lane_width)
         self.cameras = [frame.cameras for frame in frames]
         self.log = _log(name, frames, VectorMap(lanes), zlib.crc32(f"{boards.seed}/{name}".encode()))
@@ -162,10 +162,10 @@ class _Segment:
         self.log = replace(self.log, map=VectorMap({}))
 
 
-def _log(name: str, frames: Sequence[DriveFrame], vector_map: VectorMap, seed: int) -> Log:
+def _log(name: str, frames: Sequence[SegmentFrame], vector_map: VectorMap, seed: int) -> Log:
     poses = np.stack([frame.lanes.global_from_ego for frame in frames])
     times = np.array([frame.timestamp_ns for frame in frames], np.int64)
-    nobody = _no_tracks(len(frames))
+    nobody = Tracks.empty(len(frames))
     return Log(
         name=name,
         source="openlane_v2",
@@ -176,18 +176,6 @@ def _log(name: str, frames: Sequence[DriveFrame], vector_map: VectorMap, seed: i
         actors=nobody,
         keyframes=tuple(KeyFrame(int(time), pose, i) for i, (time, pose) in enumerate(zip(times, poses, strict=True))),
         seed=seed,
-    )
-
-
-def _no_tracks(frames: int) -> Tracks:
-    return Tracks(
-        position=np.zeros((frames, 0, 3)),
-        yaw=np.zeros((frames, 0)),
-        size=np.zeros((0, 3)),
-        category=np.zeros(0, np.int32),
-        occluded=np.zeros((frames, 0), bool),
-        valid=np.zeros((frames, 0), bool),
-        uuid=np.zeros(0, str),
     )
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from tflane_jax.errors import UserError
-from tflane_jax.files.fields import as_list, load_json, member, shown
+from tflane_jax.files.fields import as_list, is_time, load_json, member, shown
 
 SPLIT_FILE, LOG_FILE = "OpenLane-V2/data_dict_subset_A.json", "subset_A_segment_to_av2_log.json"
 
@@ -52,6 +52,6 @@ def _by_split(path: Path) -> Mapping[str, Mapping[str, Any]]:
 
 def _time(name: Any, where: str) -> int:
     text = str(name).removesuffix(".json")
-    if not text.isdecimal() or len(text) > 19 or int(text) > np.iinfo(np.int64).max:
+    if not is_time(text):
         raise UserError(f"{where}: {shown(name)} is no frame, expected <timestamp>.json")
     return int(text)

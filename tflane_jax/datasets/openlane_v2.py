@@ -36,7 +36,7 @@ from tflane_jax.datasets.openlane_frames import (
     subset_of,
     without_map_changes,
 )
-from tflane_jax.datasets.openlane_markers import BoardsConfig, DriveFrame, SegmentBoards, drive_frame
+from tflane_jax.datasets.openlane_markers import BoardsConfig, SegmentBoards, SegmentFrame, segment_frame
 from tflane_jax.datasets.openlane_sd_map import SegmentSdMaps
 from tflane_jax.datasets.openlane_tracks import SourceTracks, WithoutTracks
 from tflane_jax.datasets.overlap import frame_drives
@@ -251,12 +251,12 @@ class OpenLaneV2Dataset:
         views = camera_views(file.cameras, self._fits, self.config.image)
         return replace(views, vehicle=vehicle_state(file.global_from_ego, self.config.can_bus))
 
-    def _segment(self, scene: str) -> list[DriveFrame]:
+    def _segment(self, scene: str) -> list[SegmentFrame]:
         """Return the frames of a segment as boards need them."""
         rows = range(self._first[scene], len(self))
         frames = takewhile(lambda index: self.scene(index) == scene, rows)
         names = self._names[0]
-        return [drive_frame(self._files(index)[0], names, self._time(index), self._sizes) for index in frames]
+        return [segment_frame(self._files(index)[0], names, self._time(index), self._sizes) for index in frames]
 
 
 def nominal_example(config: OpenLaneV2Config) -> Example:

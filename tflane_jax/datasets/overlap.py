@@ -27,7 +27,7 @@ _POSE_INTERVAL = 0.1  # seconds between the poses of a log that are compared; th
 
 
 @dataclass(frozen=True)
-class Drive:
+class DrivenPath:
     """Ego positions of one recording.
 
     Attributes:
@@ -42,7 +42,7 @@ class Drive:
     positions: Float[np.ndarray, "f 2"]
 
 
-def read_drives(root: Path) -> list[Drive]:
+def read_drives(root: Path) -> list[DrivenPath]:
     """Return the drives of a folder of Argoverse 2 logs, or of OpenLane-V2 (`<segment>/info/<timestamp>.json`).
 
     OpenLane-V2's files do not name the city.
@@ -58,25 +58,25 @@ def read_drives(root: Path) -> list[Drive]:
             pose = member(load_members(file, ("pose",)), "pose", str(file))
             where = numbers(member(pose, "translation", f"{file}: pose"), (3,), f"{file}: pose.translation")
             drives.setdefault(file.parent.parent, []).append(where[:2])
-        return [Drive(folder.name, "", np.stack(where)) for folder, where in drives.items()]
+        return [DrivenPath(folder.name, "", np.stack(where)) for folder, where in drives.items()]
     return [_log_drive(folder) for folder in find_logs(root)]
 
 
-def _log_drive(folder: Path) -> Drive:
+def _log_drive(folder: Path) -> DrivenPath:
     times, poses = read_poses(folder)
     _, kept = np.unique(times // int(_POSE_INTERVAL * 1e9), return_index=True)
     if not (city := city_of(folder)):
         raise UserError(f"{folder / 'map'} has no log_map_archive_*.json, whose name tells the city")
-    return Drive(folder.name, city, poses[kept, :2, 3])
+    return DrivenPath(folder.name, city, poses[kept, :2, 3])
 
 
-def frame_drives(dataset: IndexedExamples) -> list[Drive]:
+def frame_drives(dataset: IndexedExamples) -> list[DrivenPath]:
     """Return the drives of a dataset: the positions of its examples in their order."""
     drives: dict[tuple[str, str], list[np.ndarray]] = {}
     for index in range(len(dataset)):
         info = dataset.info(index)
         drives.setdefault((info.scene, info.area), []).append(info.global_from_ego[:2, 3])
-    return [Drive(scene, area, np.stack(where)) for (scene, area), where in drives.items()]
+    return [DrivenPath(scene, area, np.stack(where)) for (scene, area), where in drives.items()]
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ class Nearness:
         return f"{said}. Files do not name the city of {guessed} of them, which may be another with equal coordinates"
 
 
-def nearness(train: Sequence[Drive], dataset: IndexedExamples) -> Nearness:
+def nearness(train: Sequence[DrivenPath], dataset: IndexedExamples) -> Nearness:
     """Compare every example of a dataset with the drives of the training split, area by area.
 
     Raises UserError where one side has no frames.
@@ -163,8 +163,8 @@ class Overlap:
         return sorted(rows, key=lambda row: (-float(row["frames within 20 m"]), float(row["least m"])))[:count]
 
 
-def overlap(train: Sequence[Drive], validation: Sequence[Drive]) -> Overlap:
-    """Compare positions within each city, see `Drive.area`; raises UserError where one side has no drive."""
+def overlap(train: Sequence[DrivenPath], validation: Sequence[DrivenPath]) -> Overlap:
+    """Compare positions within each city, see `DrivenPath.area`; raises UserError where one side has no drive."""
     from scipy.spatial import KDTree
 
     for what, drives in (("training", train), ("validation", validation)):

@@ -22,6 +22,8 @@ FARTHEST_STEP = 10_000.0
 """Metres from one point of a map's line to the next, or along one of its arcs; more is a damaged number."""
 FARTHEST, MOST_PIXELS = 1e8, 1e6
 """Metres of a coordinate, and pixels of a camera matrix; more would be infinite in float32, or senseless."""
+LARGEST_IMAGE = 20_000
+"""Pixels of a side of an image; arrays are made for the sizes that a calibration names."""
 # Metres from the vehicle to a box; the annotators of nuScenes saw some 150 m far.
 _UNSEEN = 500.0
 
@@ -31,12 +33,15 @@ SHORTEST, LONGEST = 0.002, 60.0
 T = TypeVar("T")
 
 
-def check_motion(position: Float[np.ndarray, "f 2"], times_ns: Int[np.ndarray, " f"], where: Sequence[str]) -> None:
+def check_motion(position: Float[np.ndarray, "f d"], times_ns: Int[np.ndarray, " f"], where: Sequence[str]) -> None:
     """Raise UserError, which names the place, where a vehicle jumps from one key frame to the next."""
     metres, seconds = np.linalg.norm(np.diff(position, axis=0), axis=-1), np.diff(times_ns) / 1e9
     if (jumps := metres > _FASTEST * seconds + _JITTER).any():
         i = int(jumps.argmax())
-        raise UserError(f"{where[i + 1]}: the vehicle is {metres[i]:.0f} m from its place {seconds[i]:.2g} s before")
+        raise UserError(
+            f"{where[i + 1]}: the vehicle is {metres[i]:.0f} m from its place {seconds[i]:.2g} s before: pose or "
+            "timestamp is wrong"
+        )
 
 
 def check_interval(times_ns: Int[np.ndarray, " f"], unit: str, where: str) -> None:

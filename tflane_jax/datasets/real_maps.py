@@ -17,7 +17,7 @@ import numpy as np
 from tflane_jax.datasets.base import ExampleConfig, Split
 from tflane_jax.datasets.cache import CachedDataset, cached
 from tflane_jax.datasets.data_source import Choice, DataSource, FolderCheck
-from tflane_jax.datasets.overlap import Drive
+from tflane_jax.datasets.overlap import DrivenPath
 from tflane_jax.datasets.procedural import SimulatedDataset, scene_limits
 from tflane_jax.datasets.recorded_logs import RECORDED_EXAMPLE, RecordedConfig
 from tflane_jax.datasets.road_maps import MapFile, chosen_maps, find_maps
@@ -181,14 +181,14 @@ class RealMapData:
         )
 
 
-def _drives(config: RealMapConfig) -> list[Drive]:
+def _drives(config: RealMapConfig) -> list[DrivenPath]:
     """Return the drives of the logs on whose maps the scenes are; nothing if all roads are generated.
 
     GeoJSON maps have coordinates of their own, which no recording shares.
     """
     found = chosen_maps(config.maps, config.logs, config.without) if config.generated < 1.0 else []
     maps = [_read(one) for one in found]
-    return [Drive(one.name, one.area, one.places) for one in maps if one.source != "geojson"]
+    return [DrivenPath(one.name, one.area, one.places) for one in maps if one.source != "geojson"]
 
 
 # Scenes of --data real-maps where the configuration has other data.
@@ -244,5 +244,6 @@ SOURCE = DataSource(
     sample=lambda config: RealMapDataset(config).example(0),
     build=lambda config, progress: len(_open(config, progress)),
     drives=_drives,
+    recorded=False,
     check=check_real_maps,
 )

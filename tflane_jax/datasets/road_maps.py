@@ -184,7 +184,8 @@ def _may_hold_lanes(file: Path) -> bool:
     try:
         with zipfile.ZipFile(file) as archive:
             return "map_type.npy" in archive.namelist()
-    except (OSError, zipfile.BadZipFile):
+    # A damaged archive may raise any error of zipfile.
+    except Exception:
         return True
 
 

@@ -2,8 +2,8 @@
 
 The content is written under a hidden temporary name beside its destination and then renamed. A reader sees the old
 content or the new one, never a part. A killed process leaves the destination as it was, and at most a file or folder
-named `.<name>.<process>-<number>.tmp`. What was renamed survives a power failure: the content is flushed to the device
-before, the folder after.
+named `.<name>.<process>-<number>.tmp`, behind which a writer may put a suffix of its own. What was renamed survives a
+power failure: the content is flushed to the device before, the folder after.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from typing import Any
 from tflane_jax.errors import UserError
 
 _counter = itertools.count()
-_TEMPORARY = re.compile(r"\..+\.\d+-\d+\.tmp")
+_TEMPORARY = re.compile(r"\..+\.\d+-\d+\.tmp(\.\w+)?")
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 _FORBIDDEN = (errno.EACCES, errno.EPERM, errno.EROFS)
 
@@ -35,7 +35,7 @@ def replacing(path: Path | str) -> Iterator[Path]:
     parents of `path` are created. After an error the temporary content is deleted and `path` is as it was.
 
     The temporary name ends in `.tmp`, because `Path.glob("*.json")` finds hidden files too. Writers that choose a
-    format by the suffix need to be told the format.
+    format by the suffix need to be told the format, or write to this name with their suffix behind it.
 
     Two renames replace a folder. A process killed between them leaves the old folder under its temporary name.
 
@@ -153,7 +153,7 @@ def _check_name(path: Path) -> None:
 
 
 def is_temporary(path: Path | str) -> bool:
-    """Return whether the name is one that `replacing` gives, so that a killed process may have left it."""
+    """Return whether the name is one that `replacing` gives, also with a further suffix: a killed process left it."""
     return _TEMPORARY.fullmatch(Path(path).name) is not None
 
 

@@ -15,7 +15,7 @@ Kind = Literal["integer", "number", "text"]
 
 
 def read_columns(path: Path, columns: Mapping[str, Kind]) -> dict[str, np.ndarray]:
-    """Return columns of a feather file; further columns are not read.
+    """Return columns of a feather file; further columns are left out.
 
     Raises:
         UserError: pyarrow is missing, the file cannot be read or lacks a column, or a value is not of the column's
@@ -30,6 +30,8 @@ def read_columns(path: Path, columns: Mapping[str, Kind]) -> dict[str, np.ndarra
         raise UserError(f"{path} is missing: download it with the Argoverse 2 sensor dataset")
     try:
         table = feather.read_table(path)
+        # Of a damaged file, offsets and numbers of dictionary entries may point anywhere.
+        table.validate(full=True)
     except (pyarrow.ArrowException, OSError) as error:
         raise UserError(f"{path} is not a readable feather file ({error}): download it again") from error
     if missing := [name for name in columns if name not in table.column_names]:

@@ -20,7 +20,9 @@ from tflane_jax.files.plain_pickle import load_plain_pickle
 
 _SPACE = re.compile(r"[ \t\n\r]*")
 _FARTHEST = 1e5
-"""Metres from the vehicle, or pixels, that no line of these formats has."""
+"""Largest coordinate of a line, metres in the vehicle's frame."""
+_MOST, _DEEPEST = 10_000_000, 32
+"""Numbers in one entry, and lists in lists, that no file of these formats has."""
 
 
 def load_file(path: Path) -> Any:
@@ -116,7 +118,7 @@ def member(record: Any, name: str, where: str) -> Any:
     if not isinstance(record, Mapping):
         raise UserError(f"{where} is {_kind(record)}, expected a mapping with the entry {name!r}")
     if name not in record:
-        there = ", ".join(map(reprlib.repr, list(record)[:6]))
+        there = ", ".join(map(shown, list(record)[:6]))
         raise UserError(f"{where} lacks the entry {name!r} (it has {there or 'none'})")
     return record[name]
 
@@ -162,6 +164,7 @@ def _as_array(value: Any, shape: tuple[int | None, ...], where: str) -> np.ndarr
     expected = f"expected numbers of shape {_shape(shape)}"
     if value is None:
         raise UserError(f"{where} is {_kind(value)}, {expected}")
+    _check_size(value, shape, where)
     try:
         array = np.asarray(value)
     except (TypeError, ValueError, RecursionError):
@@ -184,6 +187,27 @@ def _as_array(value: Any, shape: tuple[int | None, ...], where: str) -> np.ndarr
     if array.ndim == 0 or array.dtype.kind not in names:
         raise UserError(f"{where} is {_kind(value)}, {expected}")
     raise UserError(f"{where} is {_kind(value)}, {expected}, not {names[array.dtype.kind]}")
+
+
+def _check_size(value: Any, shape: tuple[int | None, ...], where: str) -> None:
+    """Raise UserError for nested lists that are too large for an array.
+
+    Lists of a pickle may hold the same list many times, so that a few bytes stand for billions of numbers.
+    """
+    level = [] if isinstance(value, np.ndarray) else [value]
+    for _ in range(_DEEPEST):
+        kinds = set(map(type, level))
+        if kinds.isdisjoint((list, tuple, np.ndarray)):
+            return
+        rows = level if kinds <= {list, tuple} else [row for row in level if isinstance(row, (list, tuple))]
+        held = sum(row.size for row in level if isinstance(row, np.ndarray)) if np.ndarray in kinds else 0
+        if held + sum(map(len, rows)) > _MOST:
+            break
+        level = list(itertools.chain.from_iterable(rows))
+    raise UserError(
+        f"{where} holds more than {_MOST} numbers, or lists nested more than {_DEEPEST} deep, expected numbers of "
+        f"shape {_shape(shape)}"
+    )
 
 
 def _has_truth_value(value: Any) -> bool:
@@ -234,7 +258,7 @@ def scores(values: Sequence[Any], where: str) -> np.ndarray:
 
 def fractions(value: Any, shape: tuple[int | None, ...], where: str) -> np.ndarray:
     """Return an array of numbers from 0 to 1; truth values count as such."""
-    array = numbers(_as_integers(value), shape, where)
+    array = numbers(_as_integers(value, shape, where), shape, where)
     if (outside := (array < 0.0) | (array > 1.0)).any():
         index = tuple(int(i) for i in np.argwhere(outside)[0])
         number = f"number {index[0]}" if len(index) == 1 else f"entry {list(index)}"
@@ -244,15 +268,16 @@ def fractions(value: Any, shape: tuple[int | None, ...], where: str) -> np.ndarr
 
 def choices(value: Any, shape: tuple[int | None, ...], where: str) -> np.ndarray:
     """Return an array of truth values, which the file may give as 0 and 1."""
-    array = numbers(_as_integers(value), shape, where)
+    array = numbers(_as_integers(value, shape, where), shape, where)
     if (other := (array != 0) & (array != 1)).any():
         index = tuple(int(i) for i in np.argwhere(other)[0])
         raise UserError(f"{where} holds {array[index]:g}{_at(index)}, expected 0 or 1")
     return array == 1
 
 
-def _as_integers(value: Any) -> Any:
+def _as_integers(value: Any, shape: tuple[int | None, ...], where: str) -> Any:
     """Return numbers and truth values as an array; anything else as it is."""
+    _check_size(value, shape, where)
     try:
         array = np.asarray(value)
     except (TypeError, ValueError, RecursionError):
@@ -273,22 +298,40 @@ def is_text(value: Any) -> bool:
     return True
 
 
+def is_time(text: str) -> bool:
+    """Return whether a text is a whole number that fits in 64 bits, as a time in nanoseconds does."""
+    return text.isdecimal() and len(text) <= 19 and int(text) <= np.iinfo(np.int64).max
+
+
+def file_within(folder: Path, name: Any, where: str) -> Path:
+    """Return the file of a relative name in a folder; a name that leads out of the folder is refused."""
+    if not is_text(name) or not name.isprintable():
+        raise UserError(f"{where} is {shown(name)}, expected the name of a file")
+    if Path(name).is_absolute() or ".." in Path(name).parts:
+        raise UserError(f"{where}: {shown(name)} is not within the folder {folder}: use a relative name")
+    return folder / name
+
+
 def whole_number(value: Any, low: int, high: int, where: str) -> int:
     """Return a whole number from `low` to `high`."""
     if isinstance(value, np.ndarray) and value.ndim == 0:
         value = value.item()
     if not _is_number(value) or not low <= value <= high or value != int(value):
-        text = "an integer of many digits" if isinstance(value, int) and abs(value) >= 2**63 else reprlib.repr(value)
-        raise UserError(f"{where} is {text:.40}, expected a whole number from {low} to {high}")
+        raise UserError(f"{where} is {shown(value)}, expected a whole number from {low} to {high}")
     return int(value)
 
 
 def shown(value: Any) -> str:
-    """Return at most 40 characters of a value for a message, whatever it is."""
+    """Return at most 40 characters of a value for a message, whatever it is.
+
+    Python refuses to write integers of more than 4300 digits, alone or in a list.
+    """
+    if isinstance(value, int) and abs(value) >= 2**63:
+        return "an integer of many digits"
     try:
         return f"{reprlib.repr(value):.40}"
     except (RecursionError, ValueError):
-        return _kind(value)
+        return f"a value {_kind(value)}"
 
 
 def _at(index: tuple[int, ...]) -> str:

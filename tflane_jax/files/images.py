@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import stat
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from types import ModuleType
@@ -66,16 +67,29 @@ def list_photos(paths: Iterable[Path], suffixes: tuple[str, ...] = PHOTO_SUFFIXE
     return photos
 
 
+def unreadable(path: Path) -> str | None:
+    """Return why a path is none of a file; None if it is one. Devices are none: they may never end."""
+    try:
+        mode = path.stat().st_mode
+    except OSError as error:
+        return error.strerror
+    except ValueError:  # a zero, or half a character
+        return "no file can have this name"
+    return None if stat.S_ISREG(mode) else "it is a folder or a device"
+
+
 def read_image(path: Path) -> UInt8[np.ndarray, "h w 3"]:
     """Return a photo as 8-bit RGB, turned upright as its EXIF record says; transparency is dropped.
 
     A JPEG decodes to the pixels of `cv2.imread`, with the channels turned round. Raises UserError where the file cannot
     be read, is empty, cut off, or no image of a known format.
     """
-    cv2 = opencv()
+    cv2, path = opencv(), Path(path)
+    if fault := unreadable(path):
+        raise UserError(f"cannot read {path}: {fault}")
     try:
         # Not cv2.imread: it cannot open every path on Windows, and says nothing about why it failed.
-        data = np.frombuffer(Path(path).read_bytes(), np.uint8)
+        data = np.frombuffer(path.read_bytes(), np.uint8)
     except OSError as error:
         raise UserError(f"cannot read {path}: {error.strerror}") from None
     if data.size == 0:

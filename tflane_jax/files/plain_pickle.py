@@ -10,6 +10,7 @@ from __future__ import annotations
 import collections
 import io
 import pickle
+import pickletools
 import reprlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -72,7 +73,8 @@ class RestrictedUnpickler(pickle.Unpickler):
     """
 
     def __init__(self, file: IO[bytes], allowed: Mapping[tuple[str, str], Any], *, encoding: str = "ASCII") -> None:
-        """Read from `file`; `encoding` is that of strings from Python 2."""
+        """Read from `file`, from its present position; `encoding` is that of strings from Python 2."""
+        _check_instructions(file)
         super().__init__(file, encoding=encoding)
         self.allowed = allowed
 
@@ -86,6 +88,21 @@ class RestrictedUnpickler(pickle.Unpickler):
     def persistent_load(self, pid: Any) -> Any:
         """Refuse objects outside the file."""
         raise Refused(f"an object outside the file ({reprlib.repr(pid)})")
+
+
+def _check_instructions(file: IO[bytes]) -> None:
+    """Refuse opcodes that bypass `find_class`, or that make the unpickler allocate memory without data.
+
+    Its table of objects grows to the largest number that the file gives one. Reading the instructions first takes two
+    or three times as long as loading them: 0.2 s for 27 MB of arrays, 1.4 s for 16 MB of lists of numbers.
+    """
+    start = file.tell()
+    for count, (instruction, argument, _) in enumerate(pickletools.genops(file)):
+        if instruction.name in ("EXT1", "EXT2", "EXT4"):
+            raise Refused("Python's extension registry")
+        if instruction.name in ("PUT", "BINPUT", "LONG_BINPUT") and int(argument or 0) > count:
+            raise pickle.UnpicklingError("it numbers its objects in an unknown way")
+    file.seek(start)
 
 
 def _array(kind: type, shape: Any, code: Any) -> np.ndarray:

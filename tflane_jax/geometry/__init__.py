@@ -12,7 +12,14 @@ from tflane_jax.geometry.cameras import (
     resize_intrinsics,
 )
 from tflane_jax.geometry.distances import chamfer, discrete_frechet
-from tflane_jax.geometry.polylines import arc_length, clip_to_range, resample, resample_lines, sample_at
+from tflane_jax.geometry.polylines import (
+    arc_length,
+    clip_to_range,
+    nearest_lines,
+    resample,
+    resample_lines,
+    sample_at,
+)
 from tflane_jax.geometry.poses import (
     invert_pose,
     matrix_from_quaternion,
@@ -36,6 +43,7 @@ __all__ = [
     "inside_image",
     "invert_pose",
     "matrix_from_quaternion",
+    "nearest_lines",
     "pose_matrix",
     "pose_yaw",
     "project",

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from tflane_jax.geometry.namespace import AnyArray
 from tflane_jax.geometry.ranges import PerceptionRange
@@ -83,6 +83,32 @@ def resample_lines(lines: Sequence[Float[AnyArray, "_ d"]], count: int) -> Float
     weight = ((distances - along[start]) / np.where(length > 0.0, length, 1.0))[..., None]
     weight = np.clip(weight, 0.0, 1.0)
     return np.where(weight == 1.0, points[stop], points[start] + weight * (points[stop] - points[start]))
+
+
+def nearest_on(line: Float[AnyArray, "n d"], place: Float[AnyArray, "2"]) -> tuple[int, float, float]:
+    """Return where a line passes nearest to a place, in the ground plane.
+
+    Returns the number of the segment, the fraction of it, and the distance in metres. A line may be a single point.
+    """
+    line = np.asarray(line)[:, :2]
+    line = np.concatenate([line, line]) if len(line) == 1 else line
+    start, step = line[:-1], np.diff(line, axis=0)
+    square = (step**2).sum(-1)
+    t = np.clip(((place - start) * step).sum(-1) / np.where(square > 0.0, square, 1.0), 0.0, 1.0)
+    distance = np.linalg.norm(start + t[:, None] * step - place, axis=-1)
+    nearest = int(distance.argmin())
+    return nearest, float(t[nearest]), float(distance[nearest])
+
+
+def nearest_lines(
+    lines: Sequence[Float[AnyArray, "_ d"]], count: int, place: Float[AnyArray, "2"] | tuple[float, float] = (0.0, 0.0)
+) -> Int[np.ndarray, " k"]:
+    """Return the numbers, ascending, of the `count` lines that pass nearest to a place in the ground plane.
+
+    Distances are to the lines, not to their vertices: a straight line that passes close by may have only its far ends.
+    """
+    distance = [nearest_on(line, np.asarray(place))[2] for line in lines]
+    return np.sort(np.argsort(distance, kind="stable")[:count])
 
 
 def clip_to_range(points: Float[AnyArray, "n d"], range_: PerceptionRange) -> list[np.ndarray]:

@@ -247,15 +247,7 @@ def street(seed: int, config: CurveConfig) -> Log:
     ]
     ids = rng.choice(marker_count(config.detector.family), len(poses), replace=False)
     frames = len(keyframes)
-    nothing = Tracks(
-        np.zeros((frames, 0, 3)),
-        np.zeros((frames, 0)),
-        np.zeros((0, 3)),
-        np.zeros(0, np.int32),
-        np.zeros((frames, 0), bool),
-        np.zeros((frames, 0), bool),
-        np.zeros(0, str),
-    )
+    nothing = Tracks.empty(frames)
     return Log(
         name=f"markers {seed}",
         source="markers",

@@ -13,7 +13,7 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from jaxtyping import Float
 
-from tflane_jax.geometry import PerceptionRange, clip_to_range, resample_lines, transform_points
+from tflane_jax.geometry import PerceptionRange, clip_to_range, nearest_lines, resample_lines, transform_points
 from tflane_jax.markers.store import MarkerStore, StoredMarker, look_up
 from tflane_jax.scene import MarkerObservations
 
@@ -183,8 +183,7 @@ def _fill_lanes(
     lane = np.repeat(np.arange(len(cut)), [len(parts) for parts in cut])
     starts = np.array([np.array_equal(p[0], whole[i, 0]) for p, i in zip(pieces, lane, strict=True)])
     ends = np.array([np.array_equal(p[-1], whole[i, -1]) for p, i in zip(pieces, lane, strict=True)])
-    distance = [np.hypot(*(p[:, :2] - pose[:2, 3]).T).min() for p in pieces]
-    kept = np.sort(np.argsort(distance, kind="stable")[: out.lanes.shape[1]])
+    kept = nearest_lines(pieces, out.lanes.shape[1], pose[:2, 3])
     n, lane = len(kept), lane[kept]
     out.lanes[slot, :n] = resample_lines([pieces[i] for i in kept], out.lanes.shape[2])
     out.lane_valid[slot, :n] = True

@@ -26,6 +26,8 @@ UNITS = {"metre": 1.0, "millimetre": 0.001, "foot": 0.3048}
 # Decimals of a coordinate in a file: millimetres.
 _DECIMALS = 3
 _LARGEST_ID = 2**31 - 1
+# Lanes of a marker; their successors take memory of its square. In range of a marker are at most a few dozen.
+_MOST_LANES = 1000
 # Limits of lengths, metres: side of a square, coordinates of a map, distance of a lane from its marker.
 _SIZES, _MAP, _LANES = (0.01, 100.0), 1e8, 1e5
 
@@ -107,7 +109,10 @@ def _read_marker(entry: Any, number: int, unit: float, frame: str, where: str) -
     size = unit * float(numbers(side, (), f"{where}: size"))
     if not _SIZES[0] <= size <= _SIZES[1]:
         raise UserError(f"{where}: size is {size:g} m, expected {_SIZES[0]:g} to {_SIZES[1]:g} m")
-    lanes = unit * numbers(items(entry, "lanes", where), (None, None, 3), f"{where}: lanes")
+    listed = items(entry, "lanes", where)
+    if len(listed) > _MOST_LANES:
+        raise UserError(f"{where}: lanes has {len(listed)} entries, expected at most {_MOST_LANES} around a marker")
+    lanes = unit * numbers(listed, (None, None, 3), f"{where}: lanes")
     _within(lanes, _MAP if frame == "survey" else _LANES, f"{where}: lanes")
     if len(lanes) and lanes.shape[1] < 2:
         raise UserError(f"{where}: lanes have {lanes.shape[1]} points, expected at least 2")

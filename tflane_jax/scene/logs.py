@@ -1,11 +1,13 @@
 """The log of a drive: vector map, ego poses and tracks, in numpy on the host.
 
-The built-in world simulates a `Log` and the Argoverse 2 reader reads one; `tflane_jax.datasets.examples` turns
-one moment into an `Example`. Global coordinates (city frame) stay float64. Only tracks are padded, with `valid`.
+The built-in world simulates a `Log`, and the readers of Argoverse 2 and nuScenes read one;
+`tflane_jax.datasets.examples` turns one moment into an `Example`. Global coordinates (city frame) stay float64. Only
+tracks are padded, with `valid`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -107,6 +109,20 @@ class Tracks:
     occluded: np.ndarray
     valid: np.ndarray
     uuid: np.ndarray
+
+    @classmethod
+    def empty(cls, frames: int, uuid: np.ndarray | Sequence[str] = ()) -> Tracks:
+        """Return tracks without a box: one for each name, by default none."""
+        count = len(uuid)
+        return cls(
+            position=np.zeros((frames, count, 3)),
+            yaw=np.zeros((frames, count)),
+            size=np.zeros((count, 3)),
+            category=np.zeros(count, np.int32),
+            occluded=np.zeros((frames, count), bool),
+            valid=np.zeros((frames, count), bool),
+            uuid=np.array(uuid, str),
+        )
 
     @property
     def frames(self) -> int:

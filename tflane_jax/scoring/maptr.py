@@ -9,7 +9,6 @@ variant for Argoverse 2. For groups by occlusion, the truth has a field of ours,
 from __future__ import annotations
 
 import json
-import reprlib
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,7 @@ import numpy as np
 
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import replacing
-from tflane_jax.files.fields import is_text, items, load_file, member, numbers, scores, whole_number
+from tflane_jax.files.fields import is_text, items, load_file, member, numbers, scores, shown, whole_number
 from tflane_jax.metrics.map_matching import LINE_CLASSES, Dims, MapDetections, MapTruth
 
 # Metres from the vehicle: no line of a local map is so far away.
@@ -87,7 +86,7 @@ def _samples(path: Path, field: str) -> list[tuple[str, Any, str]]:
     for i, record in enumerate(items(load_file(path), field, str(path))):
         token = member(record, "sample_token", f"{path}: {field}[{i}]")
         if not is_text(token) or not token:
-            raise UserError(f"{path}: {field}[{i}].sample_token is {reprlib.repr(token)}, expected a text")
+            raise UserError(f"{path}: {field}[{i}].sample_token is {shown(token)}, expected a text")
         where = f"{path}, sample {token}"
         if token in seen:
             raise UserError(f"{where} is there twice")
@@ -117,12 +116,10 @@ def _lines(vectors: Any, where: str, least: int, dims: Dims, types: _Types) -> t
             raise UserError(f"{at}.pts has shape {line.shape}, expected (n, {dims}): such files are scored by {other}")
         count = vector.get("pts_num", len(line))
         if not isinstance(count, (int, float, np.number)) or count != len(line):
-            told = reprlib.repr(count)
-            raise UserError(f"{at}.pts_num is {told}, but pts has {len(line)} points: is the line cut off?")
+            raise UserError(f"{at}.pts_num is {shown(count)}, but pts has {len(line)} points: is the line cut off?")
         name = member(vector, "cls_name", at)
         if not isinstance(name, str) or name not in LINE_CLASSES:
-            shown = reprlib.repr(name)
-            raise UserError(f"{at}.cls_name is {shown:.40}, expected one of {', '.join(LINE_CLASSES)}")
+            raise UserError(f"{at}.cls_name is {shown(name)}, expected one of {', '.join(LINE_CLASSES)}")
         _check_type(vector, name, at, types)
         points.append(line)
         classes.append(LINE_CLASSES.index(name))

@@ -12,7 +12,6 @@ where lines may have different numbers of points.
 
 from __future__ import annotations
 
-import reprlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tflane_jax.errors import UserError
-from tflane_jax.files.fields import choices, fractions, is_text, items, line_points, load_file, member, scores
+from tflane_jax.files.fields import choices, fractions, is_text, items, line_points, load_file, member, scores, shown
 from tflane_jax.files.npz import read_npz
 from tflane_jax.metrics.frames import LaneDetections, LaneTruth
 
@@ -72,7 +71,7 @@ def _frames(path: Path) -> Iterator[tuple[PlainKey, Any, str]]:
 
 def _scene(value: Any, where: str) -> str:
     if isinstance(value, bool) or not (is_text(value) or isinstance(value, (int, np.integer))):
-        raise UserError(f"{where}: scene is {reprlib.repr(value)}, expected a text")
+        raise UserError(f"{where}: scene is {shown(value)}, expected a text")
     return str(value)
 
 
@@ -81,12 +80,8 @@ def _time(value: Any, where: str) -> str:
     digits = isinstance(value, str) and value.strip().isascii() and value.strip().isdigit()
     whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
     if not (digits or (whole and abs(int(value)) < 2**63)):
-        raise UserError(f"{where}: timestamp_ns is {_shown(value)}, expected whole nanoseconds")
+        raise UserError(f"{where}: timestamp_ns is {shown(value)}, expected whole nanoseconds")
     return str(int(value))
-
-
-def _shown(value: Any) -> str:
-    return "an integer of many digits" if isinstance(value, int) and abs(value) >= 2**63 else reprlib.repr(value)
 
 
 def _npz_records(path: Path) -> Iterator[dict[str, Any]]:

@@ -64,7 +64,7 @@ def _openlane(form, lanes, line, lane_lane, lane_element):
             (
                 "huge id twice",
                 _huge_ids(*frame, lanes),
-                rf"{where}: {lanes}\[1\] has the id of {lanes}\[0\], of type int",
+                rf"{where}: {lanes}\[1\] has the id of {lanes}\[0\], an integer of many digits",
             ),
             ("id is a list", put(*frame, lanes, 1, "id", [0]), rf"{where}: {lanes}\[1\].id is of type list"),
             ("no elements", drop(*frame, "traffic_element"), f"{where} lacks the entry 'traffic_element'"),

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from jax.test_util import check_grads
 
 from tflane_jax.layers.image_graph import SIDES, Relation, attend_along, attend_near, mix_relations, smooth
 
@@ -136,6 +137,17 @@ def test_graph_attention_equals_loops(relation):
         exps = [math.exp(score if score > 0 else 0.2 * score) for score in scores]
         expected = sum(e * value[a, b, head] for e, (a, b) in zip(exps, cells, strict=True)) / sum(exps)
         np.testing.assert_allclose(out[i, j, head], expected, rtol=1e-5, atol=1e-5)
+
+
+def test_gradients_equal_finite_differences():
+    """The gradient of the shifts is written by hand; here it is compared in float64."""
+    valid, rng = random_valid(16), np.random.default_rng(16)
+    with jax.enable_x64(True):
+        destination, source, x = (jnp.asarray(rng.normal(size=(*SHAPE, 2))) for _ in range(3))
+        value = jnp.asarray(rng.normal(size=(*SHAPE, 2, 2)))
+        attend = jax.jit(lambda *arrays: attend_near(*arrays, jnp.asarray(valid)))
+        check_grads(attend, (destination, source, value), order=1, modes=["rev"])
+        check_grads(jax.jit(lambda x: smooth(x, jnp.asarray(valid))), (x,), order=1, modes=["rev"])
 
 
 def test_gradients_have_the_dtypes_of_what_they_belong_to():

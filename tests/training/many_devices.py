@@ -87,7 +87,7 @@ class Quiet(LineTask):
 
     def loss(self, params, batch, key):
         fit = ((jax.vmap(lambda x: self._apply(params, x))(batch["x"]) - batch["y"][:, None]) ** 2).mean()
-        return fit, {"fit": fit}
+        return fit, {"fit": fit} | self._statistics(params, batch)
 
 
 def in_parts(accumulate: int = 2) -> list:

@@ -1,4 +1,4 @@
-"""A task small enough to train in milliseconds, with everything a real one has: terms, dropout, a host callback."""
+"""A task that trains in milliseconds, with everything a real one has: terms, dropout, statistics, a host callback."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from tflane_jax.layers.batch_norm import STATISTICS
+
 
 def _host_sum(x):
     return np.asarray(x).sum(-1, dtype=np.float32)
@@ -15,8 +17,9 @@ def _host_sum(x):
 
 @dataclass(frozen=True)
 class LineTask:
-    """Fit y = w x + b with dropout noise. `blow_up` makes the term `explosive` infinite where x exceeds it.
+    """Fit y = w x + b with dropout noise, and keep a running mean of y.
 
+    `blow_up` makes the term `explosive` infinite where x exceeds it.
     `second_layer` adds an offset of its own, so that two models differ by a module.
     """
 
@@ -27,6 +30,7 @@ class LineTask:
     def init(self, key, example):
         kernel = jax.random.normal(key, (example["x"].shape[-1], self.features))
         params = {"line": {"kernel": kernel, "bias": jnp.zeros(self.features)}}
+        params[STATISTICS] = {"mean": jnp.zeros(())}
         return params | ({"second": {"offset": jnp.zeros(self.features)}} if self.second_layer else {})
 
     def loss(self, params, batch, key):
@@ -40,10 +44,14 @@ class LineTask:
         )
         fit = (error**2).mean()
         explosive = jnp.where((batch["x"] > self.blow_up).any(), jnp.inf, 0.0)
-        return fit + explosive + 0.0 * total.mean(), {"fit": fit, "explosive": explosive}
+        terms = {"fit": fit, "explosive": explosive}
+        return fit + explosive + 0.0 * total.mean(), terms | self._statistics(params, batch)
 
     def predict(self, params, example):
         return self._apply(params, example["x"])
+
+    def _statistics(self, params, batch):
+        return {STATISTICS: {"mean": 0.5 * params[STATISTICS]["mean"] + 0.5 * batch["y"].mean()}}
 
     def _apply(self, params, x):
         y = x @ params["line"]["kernel"] + params["line"]["bias"]

@@ -11,6 +11,7 @@ import pytest
 
 from tests.training.stub import LineTask, line_arrays
 from tflane_jax.errors import UserError
+from tflane_jax.models.parameters import split_statistics
 from tflane_jax.training.checkpoint import Checkpoints, Manifest
 from tflane_jax.training.schedule import OptimConfig, make_optimizer
 from tflane_jax.training.state import init_states, of_all_seeds, tree_of
@@ -50,7 +51,9 @@ def test_round_trip_is_exact(tmp_path, seeds, optimizer):
     state = state_of(seeds, optimizer=optimizer)
     odd = jax.tree.map(lambda leaf: leaf * np.float32(1 / 3), state.params)  # full mantissas
     odd["line"]["bias"] = odd["line"]["bias"].at[..., 0].set(jnp.nan).at[..., 1].set(-0.0)
-    state = state.replace(learned=ravel(odd, state.learned.layout))
+    odd, statistics = split_statistics(odd)
+    means = [jax.tree.map(lambda leaf, x=x: leaf + np.float32(x), statistics) for x in (1 / 3, -0.7)]
+    state = state.replace(learned=ravel(odd, state.learned.layout), statistics=means[0], ema_statistics=means[1])
     checkpoints = Checkpoints(tmp_path)
     checkpoints.save(state, Manifest(step=3, config=CONFIG))
     restored = Checkpoints(tmp_path).restore(3, state)
@@ -161,7 +164,7 @@ def test_a_checkpoint_of_another_model_is_refused(tmp_path, state):
 def test_files_hold_trees_by_the_names_of_the_first_version(tmp_path, state):
     found = saved(tmp_path, state, [(1, None)]).arrays(1)
     leaves, moments = ("line/kernel", "line/bias"), ("mu", "nu")
-    expected = {f"{part}/{leaf}" for part in ("params", "ema_params") for leaf in leaves}
+    expected = {f"{part}/{leaf}" for part in ("params", "ema_params") for leaf in (*leaves, "batch_stats/mean")}
     expected |= {f"opt_state/1/0/{moment}/{leaf}" for moment in moments for leaf in leaves}
     assert found.keys() == expected | {"step", "key", "opt_state/1/0/count", "opt_state/1/2/count"}
     np.testing.assert_array_equal(found["params/line/kernel"], state.params["line"]["kernel"])

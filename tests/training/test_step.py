@@ -9,6 +9,7 @@ import pytest
 from tests.training.stub import LineTask, line_arrays
 from tflane_jax.datasets.batches import batch_indices
 from tflane_jax.layers.batch_norm import STATISTICS
+from tflane_jax.models.parameters import split_statistics
 from tflane_jax.training.rng import stream
 from tflane_jax.training.schedule import OptimConfig, make_optimizer, make_schedule
 from tflane_jax.training.state import init_states
@@ -44,27 +45,29 @@ def test_trainings_of_one_model_share_a_compiled_update():
 
 def test_steps_are_plain_adamw_on_the_tasks_gradient():
     task = LineTask()
+    loss_of = lambda params, statistics, batch, key: task.loss(params | statistics, batch, key)  # noqa: E731
     decay = lambda params: {"line": {"kernel": True, "bias": False}}  # noqa: E731
     optimizer = optax.adamw(make_schedule(OPTIM, STEPS), weight_decay=OPTIM.weight_decay, mask=decay)
     state, update = alone(), make_update_step(task, OPTIM, STEPS)
-    value_and_grad, optimizer_update = jax.jit(jax.value_and_grad(task.loss, has_aux=True)), jax.jit(optimizer.update)
-    params, average = (jax.tree.map(jnp.copy, state.params) for _ in range(2))
+    value_and_grad, optimizer_update = jax.jit(jax.value_and_grad(loss_of, has_aux=True)), jax.jit(optimizer.update)
+    params, average = split_statistics(jax.tree.map(jnp.copy, state.params))[0], jax.tree.map(jnp.copy, state.params)
     opt_state = optimizer.init(params)
     for step in range(4):
         batch = batch_of(0, step)
         key = stream(jax.random.key(0), "dropout", step)
-        (loss, terms), grads = value_and_grad(params, batch, key)
+        (loss, terms), grads = value_and_grad(params, state.statistics, batch, key)
         updates, opt_state = optimizer_update(grads, opt_state, params)
         params = optax.apply_updates(params, updates)
         decay = min(OPTIM.ema_decay, (1 + step) / (10 + step))
-        average = jax.tree.map(lambda a, p, d=decay: d * a + (1 - d) * p, average, params)
+        whole = params | split_statistics(terms)[1]
+        average = jax.tree.map(lambda a, p, d=decay: d * a + (1 - d) * p, average, whole)
 
         state, metrics = update(state, batch)
         np.testing.assert_allclose(metrics["loss"], loss, rtol=1e-5)
         np.testing.assert_allclose(metrics["loss/fit"], terms["fit"], rtol=1e-5)
         norm = np.sqrt(sum(np.square(np.asarray(g)).sum() for g in jax.tree.leaves(grads)))
         np.testing.assert_allclose(metrics["grad_norm"], norm, rtol=1e-5)
-        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4), state.params, params)
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4), state.params, whole)
         jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4), state.ema_params, average)
     assert state.step == 4
 
@@ -135,16 +138,16 @@ def test_several_seeds_each_equal_a_single_seed():
 
 
 class Quiet(LineTask):
-    """The stub without dropout: its loss is a mean over examples. Statistics count examples and calls."""
+    """The stub without dropout: its loss is a mean over examples. Statistics count calls, too."""
 
     def init(self, key, example):
-        return super().init(key, example) | {STATISTICS: {"mean": jnp.zeros(()), "calls": jnp.zeros(())}}
+        params = super().init(key, example)
+        return params | {STATISTICS: params[STATISTICS] | {"calls": jnp.zeros(())}}
 
     def loss(self, params, batch, key):
         error = jax.vmap(lambda x: self._apply(params, x))(batch["x"]) - batch["y"][:, None]
-        old, fit = params[STATISTICS], (error**2).mean()
-        new = {"mean": 0.5 * old["mean"] + 0.5 * batch["y"].mean(), "calls": old["calls"] + 1}
-        return fit, {"fit": fit, STATISTICS: new}
+        new, fit = self._statistics(params, batch)[STATISTICS], (error**2).mean()
+        return fit, {"fit": fit, STATISTICS: new | {"calls": params[STATISTICS]["calls"] + 1}}
 
 
 def test_parts_of_a_batch_give_the_step_of_the_whole_where_the_loss_is_a_mean_over_examples():

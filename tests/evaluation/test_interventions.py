@@ -39,10 +39,6 @@ def test_no_scene_gets_its_own_traffic_and_every_scene_gives_to_one(sizes):
         np.testing.assert_array_equal(places, np.arange(sizes[number]) % sizes[giver[0]])
 
 
-def test_the_exchange_is_always_the_same():
-    np.testing.assert_array_equal(other_scene_rows(np.arange(50)), other_scene_rows(np.arange(50)))
-
-
 @pytest.mark.parametrize("traffic", ["none", "other-scene"])
 @pytest.mark.parametrize("streamed", [False, True])
 def test_only_traffic_changes(traffic, streamed):

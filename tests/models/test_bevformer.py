@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from tests.parameters import random_params
 from tests.slow import with_slow
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import BevGrid, PerceptionRange
@@ -158,18 +159,27 @@ def test_an_invalid_camera_may_hold_anything(encode, memory):
     assert np.abs(clean - encode(levels(), views, memory, POSE)).max() > 0.05
 
 
-def test_gradients_are_finite_whatever_padding_holds(variables):
-    views = ring().replace(valid=np.array([True, False, True]))
-    views = views.replace(camera_from_ego=np.where(views.valid[:, None, None], views.camera_from_ego, np.nan))
-    bad = [np.where(views.valid[:, None, None, None], level, np.nan).astype(np.float32) for level in levels()]
+@pytest.mark.parametrize(
+    "change", [{"capacity": 20, "remat": True}, {"attention": "kernel", "levels": 1}], ids=["deformable", "kernel"]
+)
+def test_gradients_do_not_depend_on_what_padding_holds(change):
+    config = replace(CONFIG, **change)
+    model, views = BevFormer(config), ring().replace(valid=np.array([True, False, True]))
+    features, pose = levels()[: config.levels], np.eye(4, dtype=np.float32)
+    params = random_params(model.init, features, views, None, pose)
+
+    @jax.jit
+    def learn(features, views, memory, pose):
+        loss = lambda p, f: jnp.square(model.apply(p, f, views, memory, pose)).sum()  # noqa: E731
+        return jax.value_and_grad(loss, (0, 1))(params, features)
+
+    clean = learn(features, views, BevMemory(np.zeros((5, 10, 8), np.float32), np.array(False)), pose)
+    soiled = views.replace(camera_from_ego=np.where(views.valid[:, None, None], views.camera_from_ego, np.nan))
+    bad = [np.where(views.valid[:, None, None, None], level, np.nan).astype(np.float32) for level in features]
     empty = BevMemory(np.full((5, 10, 8), np.nan, np.float32), np.array(False))
-    config = replace(CONFIG, capacity=20, remat=True)
-
-    def loss(params, features):
-        return jnp.square(BevFormer(config).apply({"params": params}, features, views, empty, POSE * np.nan)).sum()
-
-    by_params, by_features = jax.jit(jax.grad(loss, (0, 1)))(variables["params"], bad)
-    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((by_params, by_features)))
+    jax.tree.map(np.testing.assert_array_equal, learn(bad, soiled, empty, pose * np.nan), clean)
+    by_params, by_features = clean[1]
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(by_params))
     assert np.abs(by_features[0][0]).max() > 0
     assert not np.asarray(by_features[0][1]).any()
 

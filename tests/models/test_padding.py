@@ -8,20 +8,27 @@ import numpy as np
 import pytest
 
 from tests.models.cases import (
+    CAMERA_DETR,
     CAMERA_TOPONET,
     SMALL_LINES,
     SMALL_SEGMENTS,
     WITH_TRAFFIC,
+    make_bucket_example,
     make_camera_example,
     make_line_example,
     make_segment_example,
 )
+from tests.models.test_parameters import BUCKET
+from tests.slow import with_slow
 from tflane_jax.layers.polyline_encoder import PolylineEncoderConfig
+from tflane_jax.losses.bevformer_detr import BevFormerDetrLossConfig
 from tflane_jax.losses.lanesegnet import LaneSegNetLossConfig
 from tflane_jax.losses.maptr import MapTrLossConfig
+from tflane_jax.losses.maptrv2 import MapTrV2LossConfig
 from tflane_jax.losses.toponet import TopoNetLossConfig
 from tflane_jax.models.lane_denoising import DenoisingConfig
 from tflane_jax.models.lane_queries import LaneProposalConfig
+from tflane_jax.models.maptrv2 import MapTrV2Config
 from tflane_jax.models.marker_fusion import SMALL_MARKER_FUSION
 from tflane_jax.models.priors import PriorsConfig
 from tflane_jax.models.sd_map_encoder import SMALL_SD_MAP
@@ -39,14 +46,30 @@ PRIORS = PriorsConfig(
 )
 NOISE, PROPOSALS = DenoisingConfig(), LaneProposalConfig(count=3, headings=4, hidden=8)
 HOSTS = {
-    "lanes and elements from cameras": (CAMERA_TOPONET, TopoNetLossConfig(), make_camera_example),
+    "lanes and elements from cameras": (
+        replace(CAMERA_TOPONET, denoising=NOISE),
+        TopoNetLossConfig(),
+        make_camera_example,
+    ),
     "segments": (
-        replace(SMALL_SEGMENTS, decoder=replace(SMALL_SEGMENTS.decoder, proposals=PROPOSALS)),
+        replace(SMALL_SEGMENTS, decoder=replace(SMALL_SEGMENTS.decoder, proposals=PROPOSALS), denoising=NOISE),
         LaneSegNetLossConfig(class_target="quality"),
         make_segment_example,
     ),
-    "lines": (SMALL_LINES, MapTrLossConfig(class_target="quality"), make_line_example),
+    "lines": (replace(SMALL_LINES, denoising=NOISE), MapTrLossConfig(class_target="quality"), make_line_example),
+    "control points": (replace(CAMERA_DETR, denoising=NOISE), BevFormerDetrLossConfig(), make_camera_example),
+    "segments, areas and elements": (
+        BUCKET,
+        LaneSegNetLossConfig(),
+        make_bucket_example,
+    ),
+    "lines, one to many": (
+        MapTrV2Config(encoder=SMALL_LINES.encoder, decoder=SMALL_LINES.decoder, many=4, line_mask=True),
+        MapTrV2LossConfig(many_repeats=2),
+        make_line_example,
+    ),
 }
+QUICK = ("lanes and elements from cameras", "segments", "lines")
 
 
 def with_priors(example):
@@ -101,10 +124,10 @@ def dirty(example, bad):
     return example.replace(**parts)
 
 
-@pytest.mark.parametrize("name", HOSTS)
+@pytest.mark.parametrize("name", with_slow(HOSTS, QUICK))
 def test_garbage_in_padding_changes_neither_loss_nor_gradient(name):
     model, losses, make = HOSTS[name]
-    task = LaneGraphTask(model=replace(model, priors=PRIORS, denoising=NOISE), losses=losses)
+    task = LaneGraphTask(model=replace(model, priors=PRIORS), losses=losses)
     example = with_priors(make())
     params = jax.jit(task.init)(jax.random.key(0), example)
 

@@ -221,7 +221,10 @@ def test_map_coordinates_are_normalised_by_the_range_of_the_host():
 
 @pytest.mark.parametrize("absent", ["nothing", "reference"])
 def test_a_host_of_any_number_of_points_reads_examples_without_a_map(absent):
-    """As a map whose lines are all invalid; the parameters depend on the number of points."""
+    """As a map whose lines are all invalid; the parameters depend on the number of points.
+
+    The host without the prior gives the same bits, unless the fusion normalises as in the reference.
+    """
     sd_map = replace(MODULE, absent=absent, radius=5.0)
     task = LaneGraphTask(replace(BASELINE, priors=PriorsConfig(sd_map=sd_map)))
     example = make_example()
@@ -230,3 +233,6 @@ def test_a_host_of_any_number_of_points_reads_examples_without_a_map(absent):
     predict = jax.jit(task.predict)
     expected, found = (predict(params, one).centerlines for one in (nothing, example))
     jax.tree.map(np.testing.assert_array_equal, expected, found)
+    without = jax.jit(LaneGraphTask(BASELINE).predict)(params, example).centerlines
+    same = jax.tree.map(np.array_equal, without, found)
+    assert all(jax.tree.leaves(same)) == (absent == "nothing")

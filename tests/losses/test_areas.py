@@ -61,6 +61,16 @@ def test_padding_may_hold_anything_and_no_area_is_no_target():
     np.testing.assert_allclose(loss(none)[0], value, rtol=1e-6)
 
 
+def test_order_of_queries_and_areas_is_free():
+    query, area, prediction = np.array([2, 0, 3, 1]), np.array([2, 1, 0]), make_prediction()
+    other = jax.tree.map(lambda leaf: leaf[:, :, query], prediction)
+    moved, others = loss(jax.tree.map(lambda leaf: leaf[:, area], make_areas()), other)
+    whole, terms = loss(make_areas(), prediction)
+    np.testing.assert_allclose(moved, whole, rtol=1e-5)
+    for name, value in terms.items():
+        np.testing.assert_allclose(others[name], value, rtol=1e-5, err_msg=name)
+
+
 def test_terms_by_hand():
     """Perfect points and directions; classes at 0.5: 2 layers, 2 matched of 4 queries with 2 classes."""
     areas = make_areas()

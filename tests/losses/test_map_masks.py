@@ -98,6 +98,12 @@ def test_cameras_without_an_image_have_no_lines():
     assert not view_line_masks(lines([(2, 0), (9, 0), (20, 0)]), views, (12, 16)).any()
 
 
+def test_no_room_for_lines_shows_none():
+    none = MapLines.empty(0, 5)
+    assert not bev_line_mask(none, SHAPE, RANGE).any()
+    assert not view_line_masks(none, fake_views(), (12, 16)).any()
+
+
 def test_masks_are_made_under_jit_and_vmap():
     batch = stack_examples([lines([(0, 0), (5, 5), (9, 0)]), lines([(1, 0), (5, 1), (9, 9)])])
     together = jax.jit(jax.vmap(lambda one: bev_line_mask(one, SHAPE, RANGE)))(batch)

@@ -7,8 +7,10 @@ import optax
 import pytest
 
 from tests.models.cases import SMALL_LINES, make_camera_example, make_line_example
-from tflane_jax.losses.maptrv2 import MapTrV2LossConfig, mask_loss
+from tflane_jax.losses.maptr import line_targets
+from tflane_jax.losses.maptrv2 import MapTrV2LossConfig, mask_loss, one_to_many_losses
 from tflane_jax.models.maptrv2 import MapTrV2Config
+from tflane_jax.scene import LinePrediction, MapLines, stack_examples
 
 HOST = MapTrV2Config(encoder=SMALL_LINES.encoder, decoder=SMALL_LINES.decoder)
 
@@ -43,3 +45,18 @@ def test_an_absent_camera_changes_neither_loss_nor_gradient(bad):
     np.testing.assert_array_equal(again, gradient)
     assert not np.asarray(gradient[:, 1:]).any()
     assert loss > 0.1
+
+
+def test_no_room_for_lines_equals_no_lines():
+    """The one-to-many group of a map without lines: all queries learn that they are none."""
+    rng = np.random.default_rng(2)
+    points, logits = rng.uniform(-9.0, 9.0, (1, 2, 4, 5, 2)), rng.normal(size=(1, 2, 4, 3))
+    found = LinePrediction(jnp.asarray(points, jnp.float32), jnp.asarray(logits, jnp.float32))
+    targets = jax.vmap(lambda one: line_targets(one, 2, 3))(stack_examples([MapLines.empty(2, 5)]))
+    config, range_ = MapTrV2LossConfig(many_repeats=2), HOST.bev_range
+    learn = jax.jit(lambda targets: one_to_many_losses(found, targets, range_, config))
+    expected, terms = learn(targets), learn(jax.tree.map(lambda leaf: leaf[:, :0], targets))
+    for name, value in expected.items():
+        np.testing.assert_allclose(terms[name], value, rtol=1e-6, err_msg=name)
+    assert (expected["class"] > 0.0).all()
+    assert not expected["points"].any()

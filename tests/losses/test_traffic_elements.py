@@ -139,6 +139,45 @@ def test_padding_changes_nothing():
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(clean))
 
 
+def test_order_of_queries_lanes_and_elements_is_free():
+    prediction, lanes, elements = make_elements(6, (2, 3, 1), related=LAYERS)
+    found, boxes = prediction.centerlines, prediction.elements
+    query, lane = np.roll(np.arange(QUERIES), 3), np.roll(np.arange(lanes.valid.shape[1]), 1)
+    box, element = np.roll(np.arange(FOUND), 2), np.roll(np.arange(ELEMENTS), 1)
+    other = Prediction(
+        centerlines=found.replace(
+            points=found.points[:, :, query],
+            logits=found.logits[:, :, query],
+            successor_logits=found.successor_logits[:, :, query][..., query],
+        ),
+        elements=boxes.replace(
+            box=boxes.box[:, :, box],
+            logits=boxes.logits[:, :, box],
+            lane_logits=boxes.lane_logits[:, :, query][..., box],
+        ),
+    )
+    graph = jax.tree.map(lambda leaf: leaf[:, lane], lanes)
+    graph = graph.replace(successor=graph.successor[..., lane])
+    signs = jax.tree.map(lambda leaf: leaf[:, element], elements.replace(lane=elements.lane.swapaxes(1, 2)[..., lane]))
+    signs = signs.replace(lane=signs.lane.swapaxes(1, 2))
+    (whole, terms), gradient = value_and_gradient(prediction, lanes, elements, SIZES, TopoNetLossConfig())
+    (moved, others), turned = value_and_gradient(other, graph, signs, SIZES, TopoNetLossConfig())
+    np.testing.assert_allclose(moved, whole, rtol=1e-5)
+    for name, value in terms.items():
+        np.testing.assert_allclose(others[name], value, rtol=1e-5, err_msg=name)
+    for part, order in (("centerlines", query), ("elements", box)):
+        own, same = getattr(gradient, part).logits[:, :, order], getattr(turned, part).logits
+        np.testing.assert_allclose(same, own, rtol=1e-4, atol=1e-6)
+
+
+def test_no_room_for_elements_equals_no_elements():
+    prediction, lanes, elements = make_elements(1, (0, 0, 0), related=LAYERS)
+    none = jax.tree.map(lambda leaf: leaf[:, :0], elements.replace(lane=elements.lane.swapaxes(1, 2)))
+    none = none.replace(lane=none.lane.swapaxes(1, 2))
+    expected, found = (value_and_gradient(prediction, lanes, e, SIZES, TopoNetLossConfig()) for e in (elements, none))
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-9), found, expected)
+
+
 def test_control_points_are_compared_if_configured():
     prediction, lanes, _ = make_elements(4, (0, 0, 0), related=LAYERS)
     one = jax.tree.map(lambda leaf: leaf[0], (prediction.centerlines, lanes))

@@ -11,6 +11,7 @@ from tests.fast_compile import compile_fast
 compile_fast()
 
 import jax  # noqa: E402
+from hypothesis import settings  # noqa: E402
 
 from tflane_jax.training.runtime import configure_jax  # noqa: E402
 
@@ -30,6 +31,9 @@ jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
 os.fsync = lambda handle: None
 # Tracing makes millions of objects and hardly any garbage: collecting at the default rate costs a tenth of the time.
 gc.set_threshold(100_000, 50, 100)
+# Every run draws the same examples, on machines of any speed; files say how many.
+settings.register_profile("repeatable", derandomize=True, deadline=None)
+settings.load_profile("repeatable")
 
 
 def pytest_collection_modifyitems(items):

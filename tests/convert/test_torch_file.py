@@ -114,7 +114,7 @@ def test_a_storage_that_is_part_of_another(tmp_path):
         read_state_dict(write_legacy(tmp_path / "w.pkl", beyond))
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.data())
 def test_any_view_inside_its_storage_is_numpys_and_any_other_is_refused(tmp_path_factory, data):
     small = st.integers(0, 5)

@@ -37,7 +37,7 @@ def test_damaged_files_are_named(tmp_path):
         read_state_dict(tmp_path / "w.pth")
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(st.integers(0, 10**6), st.integers(1, 255), st.sampled_from([write_zip, write_legacy]))
 def test_a_flipped_byte_never_escapes(tmp_path_factory, place, change, write):
     folder = tmp_path_factory.mktemp("flip")

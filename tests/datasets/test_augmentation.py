@@ -141,7 +141,7 @@ def test_points_stay_on_the_painted_line(seed):
     assert np.abs(centre).max() < 1.0
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.integers(0, 2**32), st.floats(0.0, 1.5), st.floats(0.4, 1.0))
 def test_warped_lines_keep_the_vocabularys_promises(seed, rotation, crop):
     after = augment(example(seed), replace(GEOMETRY, rotation=rotation, crop=crop), seed)

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from tflane_jax.datasets.batches import batch_indices, batches
 
 
-@settings(max_examples=30, deadline=None, derandomize=True)
+@settings(max_examples=30)
 @given(st.integers(1, 12), st.integers(1, 30), st.integers(0, 5))
 def test_every_epoch_is_a_permutation(examples, batch_size, seed):
     epochs = 3

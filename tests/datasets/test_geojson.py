@@ -31,7 +31,7 @@ def east_north(latitude, longitude, origin):
     return np.stack([offset @ east, offset @ north], -1)
 
 
-@settings(max_examples=60, deadline=None, derandomize=True)
+@settings(max_examples=60)
 @given(
     st.floats(-60, 60),
     st.floats(-180, 180),

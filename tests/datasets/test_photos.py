@@ -86,7 +86,7 @@ def test_numbers_in_other_units_are_refused(shape, camera, message):
         fit_photo(np.zeros((*shape, 3), np.uint8), camera)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     st.integers(1, 6000),
     st.integers(1, 6000),

@@ -24,7 +24,7 @@ from tflane_jax.scene import stack_examples
 EXAMPLES = stack_examples([fake_example(i) for i in range(7)])
 
 
-@settings(max_examples=40, deadline=None, derandomize=True)
+@settings(max_examples=40)
 @given(sizes=st.lists(st.integers(1, 4), min_size=2, max_size=9))
 def test_no_scene_gets_its_own_traffic_and_every_scene_gives_to_one(sizes):
     scene = np.repeat(np.arange(len(sizes)), sizes)

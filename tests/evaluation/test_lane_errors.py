@@ -79,7 +79,7 @@ def test_lines_without_length_and_empty_frames():
     assert numbers(count_errors([]).lanes) == [0] * 5
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(seed=st.integers(0, 10**6), turn=st.floats(-3.0, 3.0), shift=st.floats(-30.0, 30.0))
 def test_every_line_has_one_fate_in_any_frame_of_reference(seed, turn, shift):
     truth, detected, scores = frame(seed)

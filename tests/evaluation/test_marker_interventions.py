@@ -26,7 +26,7 @@ def with_markers(seed, capacity=3, lanes=4, points=5):
     return replace(fake_example(seed), markers=markers)
 
 
-@settings(max_examples=20, deadline=None, derandomize=True)
+@settings(max_examples=20)
 @given(seed=st.integers(0, 99), x=st.floats(-40, 40, width=32), y=st.floats(-40, 40, width=32))
 @pytest.mark.parametrize("wrong", ["detection", "store"])
 def test_lanes_move_by_the_offset_and_only_markers_change(wrong, seed, x, y):

@@ -14,7 +14,7 @@ def casteljau(controls, t):
     return controls[0]
 
 
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(st.integers(2, 7), st.integers(0, 5), st.integers(0, 1000))
 def test_a_curve_is_drawn_and_found_again(controls, more, seed):
     corners = np.random.default_rng(seed).normal(size=(controls, 3)) * 20

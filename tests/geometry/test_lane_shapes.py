@@ -49,7 +49,7 @@ def photographed(curve, pitch):
     return pixels
 
 
-@settings(max_examples=60, deadline=None, derandomize=True)
+@settings(max_examples=60)
 @given(curves, pitches)
 def test_a_pinhole_image_of_the_ground_curve_is_the_image_curve(curve, pitch):
     pixels = photographed(curve, pitch)
@@ -57,7 +57,7 @@ def test_a_pinhole_image_of_the_ground_curve_is_the_image_curve(curve, pitch):
     np.testing.assert_allclose(curve_columns(image, pixels[:, 1]), pixels[:, 0], rtol=1e-7, atol=1e-5)
 
 
-@settings(max_examples=60, deadline=None, derandomize=True)
+@settings(max_examples=60)
 @given(curves, pitches)
 def test_the_papers_tilt_turns_image_points_without_dividing(curve, pitch):
     flat = flat_image_curve(curve, FOCAL, HEIGHT)
@@ -69,7 +69,7 @@ def test_the_papers_tilt_turns_image_points_without_dividing(curve, pitch):
     np.testing.assert_allclose(curve_columns(vector(tilted), turned), columns, rtol=1e-7, atol=1e-6)
 
 
-@settings(max_examples=30, deadline=None, derandomize=True)
+@settings(max_examples=30)
 @given(curves)
 def test_without_pitch_all_three_agree(curve):
     flat = flat_image_curve(curve, FOCAL, HEIGHT)
@@ -89,7 +89,7 @@ def test_the_papers_tilt_is_right_for_small_pitch_only():
     assert errors[2] > 2.0
 
 
-@settings(max_examples=30, deadline=None, derandomize=True)
+@settings(max_examples=30)
 @given(curves, pitches)
 def test_normalised_curves_are_the_same_curves(curve, pitch):
     image = pinhole_image_curve(curve, FOCAL, HEIGHT, pitch)

@@ -14,7 +14,7 @@ from tests.shared import shared_root
 from tflane_jax.geometry import PerceptionRange, pose_matrix, transform_points
 from tflane_jax.geometry.polylines import arc_length, clip_to_range, nearest_lines, nearest_on, resample, sample_at
 
-QUICK = settings(max_examples=60, deadline=None, derandomize=True)
+QUICK = settings(max_examples=60)
 RANGE = PerceptionRange((-10.0, 10.0), (-5.0, 5.0))
 GOLDEN = shared_root() / "golden/metrics/resample/cases.json.gz"
 

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from tflane_jax.geometry.polylines import resample, resample_lines
 
 
-@settings(max_examples=30, deadline=None, derandomize=True)
+@settings(max_examples=30)
 @given(seed=st.integers(0, 10**6), lines=st.integers(1, 8), count=st.integers(2, 12))
 def test_equals_one_at_a_time(seed, lines, count):
     rng = np.random.default_rng(seed)

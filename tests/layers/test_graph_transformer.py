@@ -209,7 +209,7 @@ def test_nodes_without_incoming_edges_have_finite_gradients(variant):
 _normalise = jax.jit(normalise, static_argnums=(1, 2))
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(st.integers(0, 10**6), st.sampled_from(["rows", "columns"]), st.sampled_from(["kept", "removed", "lonely"]))
 def test_edges_into_a_node_sum_to_one(seed, receivers, loops):
     graphs = random_graphs(seed, 2, 4, 4, fraction=0.3)

@@ -88,7 +88,7 @@ def test_gradients_equal_those_of_the_matrices(relations):
 _mix_all = jax.jit(lambda s, x, v: mix_relations(RELATIONS, s, x, v))
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.integers(0, 10**6))
 def test_mixtures_keep_a_constant(seed):
     """Rows sum to 1: a constant stays for all mixing weights and any padding."""

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import shapely
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from tflane_jax.layers.masks import (
@@ -72,7 +72,6 @@ def test_unused_quadrants_are_not_built():
     assert sum(leaf.size for leaf in jax.tree.leaves(mask)) <= 30 * 30 + 3 * 30  # quadrants, and the validity itself
 
 
-@settings(deadline=None)
 @given(st.integers(0, 2**31), st.floats(0.5, 20.0))
 def test_a_place_attends_to_lines_within_the_radius(seed, radius):
     rng = np.random.default_rng(seed)

@@ -173,7 +173,7 @@ def test_a_marker_without_lanes_has_the_residual_of_its_place():
 
 
 @given(st.floats(-60, 60), st.floats(-60, 60), st.floats(-np.pi, np.pi))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_lanes_stay_in_range_for_any_pose(x, y, yaw):
     move = yaw_pose(np.array([x]), np.array([y]), np.array([yaw]))
     markers = observe(detect(move @ PLACED.pose), STORE, RANGE, **SIZES).markers
@@ -187,7 +187,7 @@ def test_lanes_stay_in_range_for_any_pose(x, y, yaw):
 
 
 @given(st.floats(-30, 30), st.floats(-30, 30), st.floats(-np.pi, np.pi))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_lanes_move_with_the_frame_and_residuals_do_not(x, y, yaw):
     """The same detections from another place of the vehicle: nothing but the frame changes."""
     move, wide = yaw_pose(*np.array([[x], [y], [yaw]]))[0], PerceptionRange((-500, 500), (-500, 500))

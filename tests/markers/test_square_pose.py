@@ -20,7 +20,7 @@ pytest.importorskip("cv2")
     z=st.floats(0.5, 4.0),
     turn=st.floats(-70.0, 70.0),
 )
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 def test_exact_corners_give_the_exact_pose(x, bearing, z, turn):
     """Turned far enough for the two poses to differ, the right one is preferred."""
     truth = pose(x, bearing * x, z, turn)

@@ -68,7 +68,7 @@ def test_lanes_are_in_the_frame_of_the_marker():
 
 
 @given(st.floats(5.0, 120.0), st.floats(-60.0, 60.0), st.floats(-30.0, 30.0))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_no_stored_point_lies_outside_the_circle(radius, x, y):
     marker = store_of(fork(), placed((x, y, 3)), radius=radius, points=9).markers[0]
     distance = np.linalg.norm(in_map(marker)[..., :2] - [x, y], axis=-1)

@@ -159,7 +159,7 @@ JSON_VALUES = st.recursive(
 
 
 @given(data=st.data())
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_any_value_at_any_place_gives_a_store_or_one_message(tmp_path_factory, data):
     folder = tmp_path_factory.mktemp("store")
     record = saved(folder)

@@ -49,7 +49,7 @@ def test_pairs_are_independent():
     assert buffers_touch(lines, lines, i[:0], j[:0], 2.0).shape == (0,)
 
 
-@settings(max_examples=150, deadline=None, derandomize=True)
+@settings(max_examples=150)
 @given(seed=st.integers(0, 10**6))
 def test_shapely_agrees(seed):
     shapely = pytest.importorskip("shapely")

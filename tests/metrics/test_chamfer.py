@@ -10,7 +10,7 @@ from tflane_jax.geometry.distances import chamfer
 from tflane_jax.geometry.polylines import resample
 from tflane_jax.metrics.chamfer import PaddedLines, near_pairs, pair_chamfer
 
-QUICK = settings(max_examples=30, deadline=None, derandomize=True)
+QUICK = settings(max_examples=30)
 
 
 def random_lines(rng, count, dims):

@@ -13,7 +13,7 @@ from tests.metrics.fixtures import expected_cases, load_frames
 from tflane_jax.errors import UserError
 from tflane_jax.metrics import CenterlineFScore, LaneDetections, LaneTruth
 
-QUICK = settings(max_examples=20, deadline=None, derandomize=True)
+QUICK = settings(max_examples=20)
 
 
 def evaluate(frames):

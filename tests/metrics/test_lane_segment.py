@@ -67,7 +67,7 @@ def test_areas_by_hand():
     assert other["DET_a"] == 0.0
 
 
-@settings(max_examples=20, deadline=None, derandomize=True)
+@settings(max_examples=20)
 @given(st.integers(0, 10**6))
 def test_order_does_not_matter_and_parts_merge(seed):
     rng = np.random.default_rng(seed)
@@ -108,7 +108,7 @@ def test_arrays_may_be_reused_after_an_update():
     assert metrics.compute() == expected
 
 
-@settings(max_examples=15, deadline=None, derandomize=True)
+@settings(max_examples=15)
 @given(st.integers(0, 10**6), st.floats(-3.2, 3.2))
 def test_a_turn_about_the_vehicle_and_a_mirror_change_nothing(seed, angle):
     rng = np.random.default_rng(seed)

@@ -14,7 +14,7 @@ from tflane_jax.metrics.matching import (
 )
 from tflane_jax.metrics.topology import confidence_levels
 
-QUICK = settings(max_examples=40, deadline=None, derandomize=True)
+QUICK = settings(max_examples=40)
 
 
 def match_by_loop(distance, nearest, scores, threshold):

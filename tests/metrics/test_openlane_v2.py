@@ -221,7 +221,7 @@ def test_threshold_of_occlusion_is_strict_and_configurable():
     assert lanes == {0.2: 0, 0.3: 1, 0.4: 1, 0.41: 2}
 
 
-@settings(max_examples=15, deadline=None, derandomize=True)
+@settings(max_examples=15)
 @given(seed=st.integers(0, 10**6), version=st.sampled_from(list(VERSIONS)))
 def test_merge_equals_one_pass_and_order_of_detections_is_free(seed, version):
     frames = [random_frame(seed + i, lanes=5 * (i != 1), detections=9 * (i != 2)) for i in range(4)]
@@ -237,7 +237,7 @@ def test_merge_equals_one_pass_and_order_of_detections_is_free(seed, version):
     assert evaluate(mixed, CenterlineMetrics((version,))) == evaluate(kept, CenterlineMetrics((version,)))
 
 
-@settings(max_examples=15, deadline=None, derandomize=True)
+@settings(max_examples=15)
 @given(seed=st.integers(0, 10**6))
 def test_groups_partition_lanes_vertices_and_detections(seed):
     frames = [match_frame(*random_frame(seed + i)) for i in range(3)]

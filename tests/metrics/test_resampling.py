@@ -33,7 +33,7 @@ WEIGHTS = np.array([[1, 1, 1], [2, 0, 1], [0, 3, 0], [1, 2, 0]])
 NAMES = ("near", "far", "near")
 
 
-@settings(max_examples=40, deadline=None, derandomize=True)
+@settings(max_examples=40)
 @given(
     seed=st.integers(0, 10**6), count=st.integers(0, 40), frames=st.integers(1, 5), levels=st.sampled_from([3, 1000])
 )

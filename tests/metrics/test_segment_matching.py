@@ -139,7 +139,7 @@ def test_without_matched_pairs_there_is_no_error(true, found):
     assert not [name for name in evaluate([none], "LaneSegNet") if name.startswith("AE")]
 
 
-@settings(max_examples=15, deadline=None, derandomize=True)
+@settings(max_examples=15)
 @given(st.integers(0, 10**6))
 def test_a_rigid_motion_keeps_the_errors_of_the_same_pairs(seed):
     """A shift changes the relaxation of the AP with the distance to the vehicle, but no error of a pair."""

@@ -40,7 +40,7 @@ def test_basis_bends_rather_than_zigzags():
     assert (bend[2:] < 0.45).all()  # the alternating column alone, unscaled, would bend by 4
 
 
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(st.integers(0, 1000), st.floats(-3, 3), st.floats(-50, 50))
 def test_directions_turn_with_the_line(seed, angle, shift):
     line = np.cumsum(np.random.default_rng(seed).uniform(0.2, 1.0, (7, 2)), 0).astype(np.float32)

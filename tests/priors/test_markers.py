@@ -44,7 +44,7 @@ def test_confidence_is_equation_two():
 
 
 @given(st.floats(0, 200), st.floats(0, 200), st.floats(0.1, 50), st.floats(0.1, 50))
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 def test_confidence_falls_with_distance_and_residual(distance, residual, more, shake):
     config = MarkerPriorConfig()
     here = confidence(np.array([distance]), np.array([residual]), config)

@@ -120,7 +120,7 @@ def test_too_few_frames_is_an_error():
         select_traffic_flow(make_flow(frames=4), CONFIG)
 
 
-@settings(max_examples=60, deadline=None, derandomize=True)
+@settings(max_examples=60)
 @given(st.floats(0.5, 70), st.floats(-np.pi, np.pi), st.floats(0.1, 30))
 def test_weights(distance, bearing, farther):
     def weight(d, b):
@@ -136,7 +136,7 @@ def test_weights(distance, bearing, farther):
         assert weight(distance + farther, bearing) < here
 
 
-@settings(max_examples=20, deadline=None, derandomize=True)
+@settings(max_examples=20)
 @given(st.integers(0, 100), st.randoms(use_true_random=False))
 def test_order_of_instances_does_not_matter(seed, random):
     flow = make_flow(seed)

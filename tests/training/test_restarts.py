@@ -59,7 +59,7 @@ def test_cycles_follow_the_warm_up():
     np.testing.assert_allclose(rates[6], 0.8 * 0.55, rtol=1e-6)
 
 
-@settings(max_examples=60, deadline=None, derandomize=True)
+@settings(max_examples=60)
 @given(st.integers(1, 9), st.sampled_from([1.0, 1.3, 2.0, 3.0]), st.integers(0, 5), st.integers(1, 60))
 def test_a_fitted_run_ends_at_the_end_of_a_cycle(first, factor, warmup, length):
     config, steps = RestartsConfig(first, factor, last_cycle="fit"), warmup + length
@@ -93,7 +93,7 @@ def test_restarts_have_no_schedule_by_step():
 # Changes during a run
 
 
-@settings(max_examples=60, deadline=None, derandomize=True)
+@settings(max_examples=60)
 @given(st.integers(1, 400), st.integers(1, 400), st.floats(0.0, 3.0), st.integers(0, 900))
 def test_an_extension_keeps_the_rate_and_has_the_configured_length(elapsed, left, extend, run_left):
     config, steps = RestartsConfig(elapsed + left, floor=0.2), elapsed + run_left

@@ -184,7 +184,7 @@ def junction() -> dict[int, LaneSegment]:
     return {lane.id: lane for lane in itertools.chain(*lanes)}
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(seed=st.integers(0, 10_000), mean=st.floats(0.01, 200.0))
 def test_connectors_grow_by_what_lanes_lose(seed, mean):
     before = junction()
@@ -215,7 +215,7 @@ def _scaled(lane: LaneSegment, factor: float) -> dict[str, np.ndarray]:
     return {name: getattr(lane, name) * [factor, 1.0, 1.0] for name in LINES}
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(start=st.floats(1.0, 19.0), size=st.floats(0.5, 20.0))
 def test_the_pieces_of_a_cut_lane_are_the_lane(start, size):
     found = {7: straight(7, 0.0, (0.0, 40.0), (9,), inside=False), 8: straight(8, 0.0, (-9.0, 0.0), (7,), inside=False)}

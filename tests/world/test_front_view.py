@@ -33,7 +33,7 @@ def projected_columns(scene, number: int) -> np.ndarray:
     return np.interp(ROWS * 720.0, pixels[:, 1], pixels[:, 0], left=np.nan, right=np.nan)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(SCENES)
 def test_labels_are_the_projection_of_the_lines(scene_id):
     scene = draw_front_scene(scene_id)
@@ -47,7 +47,7 @@ def test_labels_are_the_projection_of_the_lines(scene_id):
         assert min(np.abs(u - c[there]).max() for c in columns if not np.isnan(c[there]).any()) < 0.5
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(SCENES)
 def test_labels_end_at_the_reach(scene_id):
     scene = draw_front_scene(scene_id)
@@ -60,7 +60,7 @@ def test_labels_end_at_the_reach(scene_id):
     assert longer.point_valid.sum() > lines.point_valid.sum()
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(SCENES)
 def test_both_lines_of_the_ego_lane_are_labelled_and_lines_are_sorted(scene_id):
     scene = draw_front_scene(scene_id)
@@ -82,7 +82,7 @@ def _valid_lines(scene):
     return lines.points[lines.valid], lines.point_valid[lines.valid]
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(SCENES)
 def test_a_mirrored_road_has_mirrored_labels(scene_id):
     scene = draw_front_scene(scene_id)

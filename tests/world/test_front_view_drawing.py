@@ -20,7 +20,7 @@ from tflane_jax.world.render.polygons import Solid, draw_solids
 SCENES = st.integers(0, 3 * 10**8 - 1)
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(SCENES)
 def test_the_camera_agrees_with_geometry(seed):
     camera = draw_camera(np.random.default_rng(seed), FrontCameraConfig())
@@ -47,7 +47,7 @@ def test_pitch_yaw_and_roll_have_their_documented_directions():
     assert (camera_pose(1.5, 0.0, roll=0.1) @ right)[1] < 0.0  # leaning right, the right side rises
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(SCENES)
 def test_road_coordinates_invert_the_road(seed):
     rng = np.random.default_rng(seed)

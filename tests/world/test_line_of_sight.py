@@ -75,7 +75,7 @@ def test_no_points_or_no_occluders(points):
         assert hidden_points(np.ones((points, 2)), boxes, NO_BUILDINGS).tolist() == [False] * points
 
 
-@settings(max_examples=15, deadline=None, derandomize=True)
+@settings(max_examples=15)
 @given(seed=st.integers(0, 10**6), boxes=st.integers(0, 12), buildings=st.integers(0, 3))
 def test_equals_walking_along_every_ray(seed, boxes, buildings):
     rng = np.random.default_rng(seed)

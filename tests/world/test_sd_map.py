@@ -143,7 +143,7 @@ def test_same_seed_same_bits_another_seed_another_map():
     assert np.abs(make(6, 0).points - first.points).max() > 0.2
 
 
-@settings(max_examples=40, deadline=None, derandomize=True)
+@settings(max_examples=40)
 @given(st.integers(0, 1000), st.integers(1, 30), st.floats(0.01, 5.0))
 def test_simplified_lines_stay_within_the_tolerance(seed, count, tolerance):
     line = np.cumsum(np.random.default_rng(seed).normal(size=(count, 2)), 0)

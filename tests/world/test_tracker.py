@@ -199,7 +199,7 @@ def test_padding_is_never_read():
     assert np.isfinite(first.position).all()
 
 
-@settings(max_examples=50, deadline=None, derandomize=True)
+@settings(max_examples=50)
 @given(st.floats(-50.0, 50.0))
 def test_wrapped_angles_point_the_same_way(angle):
     wrapped = float(wrap_angle(np.array(angle)))

@@ -44,7 +44,7 @@ def test_headings_turn_with_the_ground():
     np.testing.assert_allclose(warp.turned(POINTS, yaw), np.arctan2(there[:, 1], there[:, 0]), atol=1e-6)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     st.tuples(st.floats(0.6, 1.0), st.floats(1.0, 1.6)),
     st.floats(0.0, 0.5),

@@ -14,10 +14,10 @@ from tests.slow import with_slow
 
 ROOT = Path(__file__).parents[1]
 HOSTS = {
-    "lane graphs": ["toponet", "toponet, every prior", "bevformer_detr", "lanesegnet", "lanesegnet, areas"],
+    "lane graphs": ["toponet, every prior", "lanesegnet"],
+    "further lane graphs": ["toponet", "toponet, cameras", "bevformer_detr", "lanesegnet, areas"],
     "vector maps": ["maptr", "maptrv2"],
     "lane shapes": ["transformer", "gtn", "gcn", "han"],
-    "cameras": ["toponet, cameras"],
 }
 
 

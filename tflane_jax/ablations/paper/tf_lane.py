@@ -294,5 +294,5 @@ MASKING = PaperTable(
     quoted=Quoted("no numbers: the paper compares All with LT/LL only (Table 5)", ()),
     seeds=3,
     steps=2500,
-    minutes=9.0,
+    minutes=7.5,
 )

@@ -73,7 +73,7 @@ class BatchNorm(nn.Module):
             mean = self._over_batch(x.mean(axes), lax.pmean)
             variance = self._over_batch(jnp.square(x - _like(mean, x)).mean(axes), lax.pmean)
             return mean, variance, count
-        # Examples differ in the number of views, so sums are added, not means averaged.
+        # Examples differ in the number of views, so sums are added; above, all count alike and means may be averaged.
         counted = valid.reshape((-1,) + (1,) * (x.ndim - 1))
         count = self._over_batch(valid.sum(dtype=jnp.float32) * (positions / len(valid)), lax.psum)
         total = jnp.maximum(count, 1.0)

@@ -148,6 +148,11 @@ def with_remat(config: RunConfig, precision: Precision = "float32") -> RunConfig
     return dataclasses.replace(config, task=dataclasses.replace(config.task, model=model))
 
 
+def epochs_of(config: RunConfig) -> int:
+    """Return the number of epochs of `optim.epoch_steps` updates that a configuration trains for."""
+    return config.training.steps // config.optim.epoch_steps
+
+
 def with_epochs(config: RunConfig, epochs: int) -> RunConfig:
     """Return a configuration that trains for another number of epochs, each of `optim.epoch_steps` updates."""
     steps = epochs * config.optim.epoch_steps

@@ -12,12 +12,12 @@ Host and labels are those of `lanesegnet_r50.py`, with the same ablations; modul
 from dataclasses import replace
 from pathlib import Path
 
-from tflane_jax.config import OpenLaneV2Data, RunConfig, load_ablations, load_config, with_epochs
+from tflane_jax.config import OpenLaneV2Data, RunConfig, epochs_of, load_ablations, load_config, with_epochs
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 
 HERE = Path(__file__)
 HOST = str(HERE.with_name("lanesegnet_r50.py"))
-EPOCHS = 60
+EPOCHS = epochs_of(load_config(str(HERE.with_name("toponet_tfm_r50.py"))))
 
 
 def get_config() -> RunConfig:

@@ -13,11 +13,11 @@ pass, `:bfloat16` does so in half precision; `:host` is the baseline without the
 from dataclasses import replace
 from pathlib import Path
 
-from tflane_jax.config import NuScenesData, RunConfig, load_config, with_epochs, with_priors_of, with_remat
+from tflane_jax.config import NuScenesData, RunConfig, epochs_of, load_config, with_epochs, with_priors_of, with_remat
 
 HERE = Path(__file__)
 HOST = str(HERE.with_name("maptr_r50.py:published_weights"))
-EPOCHS = 60
+EPOCHS = epochs_of(load_config(str(HERE.with_name("toponet_tfm_r50.py"))))
 
 
 def get_config() -> RunConfig:

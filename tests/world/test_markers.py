@@ -8,12 +8,13 @@ import pytest
 
 from tests.datasets.small_logs import lane_map, segment
 from tflane_jax.geometry import invert_pose, transform_points
+from tflane_jax.geometry.poses import yaw_pose
 from tflane_jax.scene.logs import MapElement, VectorMap
 from tflane_jax.world import simulate as simulate_module
 from tflane_jax.world.cameras.marker_sites import visible_places
-from tflane_jax.world.mirror import mirrored
+from tflane_jax.world.mirror import markers_beside, mirrored, mirrored_map
 from tflane_jax.world.roads.config import RoadConfig, SceneKind
-from tflane_jax.world.roads.markers import PlacementConfig, place_markers
+from tflane_jax.world.roads.markers import PlacementConfig, approaching, place_markers
 from tflane_jax.world.simulate import Stream, WorldConfig, _stream, simulate
 from tflane_jax.world.traffic.simulation import TrafficConfig
 from tflane_jax.world.warp import WarpConfig, warped
@@ -202,6 +203,38 @@ def test_ids_are_unique_and_never_more_than_the_dictionary_holds():
     one = place_markers(crossroads.map, 1, replace(EXACT, per="scene"))
     assert one.pose.shape == (1, 4, 4)
     assert any(np.array_equal(one.pose[0], pose) for pose in everywhere.pose)
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("left", [False, True])
+def test_the_only_board_of_a_scene_is_one_that_the_vehicle_approaches(seed, left):
+    """Whichever approach of a junction the drive comes along, the board of that approach is kept."""
+    crossroads = simulate(23, replace(WorldConfig(traffic=EMPTY), roads=RoadConfig(kinds=((SceneKind.FOUR_WAY, 1.0),))))
+    found = mirrored_map(crossroads.map) if left else crossroads.map
+    everywhere, scene = (markers_beside(found, seed, replace(EXACT, per=per)) for per in ("approach", "scene"))
+    assert len(everywhere.pose) >= 3
+    assert scene.pose.shape == (1, 4, 4)
+    for board in everywhere.pose:
+        ahead = -board[:2, 2]  # heading of the traffic that it faces
+        drive = yaw_pose(*(board[:2, 3] + np.arange(-60.0, -10.0, 2.0)[:, None] * ahead).T, np.arctan2(*ahead[::-1]))
+        (kept,) = markers_beside(found, seed, replace(EXACT, per="scene"), None, drive).pose
+        np.testing.assert_array_equal(kept, board)
+
+
+def test_simulated_scenes_keep_the_board_that_most_frames_approach():
+    several = 0
+    for seed in range(10):
+        frames = {}
+        for per in ("approach", "scene"):
+            log = simulate(seed, WorldConfig(traffic=EMPTY, markers=replace(EXACT, per=per, side="both")))
+            assert log.markers is not None
+            frames[per] = [
+                len(approaching(log.global_from_ego, pose[:3, 3], np.arctan2(-pose[1, 2], -pose[0, 2])))
+                for pose in log.markers.pose
+            ]
+        assert frames["scene"] == [max(frames["approach"])] if frames["approach"] else not frames["scene"]
+        several += len({count > 0 for count in frames["approach"]}) == 2
+    assert several >= 3  # scenes in which another choice would leave a board that the drive never meets
 
 
 @pytest.mark.parametrize("kind", list(SceneKind))

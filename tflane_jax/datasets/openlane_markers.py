@@ -29,10 +29,7 @@ from tflane_jax.scene import MarkerObservations
 from tflane_jax.scene.logs import KeyFrame, Log, PlacedMarkers, Tracks, VectorMap
 from tflane_jax.world.mirror import markers_beside
 from tflane_jax.world.render.camera import FrontCamera
-from tflane_jax.world.roads.markers import PlacementConfig, Visible, marker_pose
-
-# Metres before a board at which drivers should see it, and to the side of the line along which its traffic comes.
-_NEAREST, _FARTHEST, _ASIDE = 8.0, 50.0, 15.0
+from tflane_jax.world.roads.markers import PlacementConfig, Visible, approaching, marker_pose
 
 
 @dataclass(frozen=True)
@@ -156,7 +153,7 @@ class _Segment:
         poses = self.log.global_from_ego
         clear = boards.placement.site == "clear"
         seen = _seen_by(poses, self.cameras, boards.placement.size) if clear else None
-        self.markers = markers_beside(self.log.map, self.log.seed, boards.placement, seen)
+        self.markers = markers_beside(self.log.map, self.log.seed, boards.placement, seen, poses)
         self.store: MarkerStore = store_of(lanes, self.markers, radius=radius, source=name)
         # Lanes are in the store; what is left of the log is small.
         self.log = replace(self.log, map=VectorMap({}))
@@ -183,13 +180,7 @@ def _seen_by(poses: Float[np.ndarray, "f 4 4"], cameras: Sequence[tuple[FrontCam
     """Return the function that says in which fraction of the frames that approach a board it lies in an image."""
 
     def visible(place: Float[np.ndarray, "3"], heading: float) -> float:
-        away = poses[:, :2, 3] - place[:2]
-        before = -(away @ [np.cos(heading), np.sin(heading)])
-        aside = np.abs(away @ [-np.sin(heading), np.cos(heading)])
-        same_way = poses[:, :2, 0] @ [np.cos(heading), np.sin(heading)] > 0.5
-        rows: list[int] = np.flatnonzero(
-            (before >= _NEAREST) & (before <= _FARTHEST) & (aside <= _ASIDE) & same_way
-        ).tolist()
+        rows: list[int] = approaching(poses, place, heading).tolist()
         if not rows:
             return 1.0
         board = marker_pose(place[None], np.array([heading + np.pi]))

@@ -72,20 +72,25 @@ def mirrored_map(found: VectorMap) -> VectorMap:
 
 
 def markers_beside(
-    found: VectorMap, seed: int, config: PlacementConfig, visible: Visible | None = None
+    found: VectorMap,
+    seed: int,
+    config: PlacementConfig,
+    visible: Visible | None = None,
+    poses: Float[np.ndarray, "f 4 4"] | None = None,
 ) -> PlacedMarkers:
     """Return the virtual markers of a recorded map, beside the lanes on the side on which traffic keeps.
 
     See `place_markers`, which is for right-hand traffic.
     """
     if not drives_on_left(found):
-        return place_markers(found, seed, config, visible)
+        return place_markers(found, seed, config, visible, poses)
 
     def seen(place: Float[np.ndarray, "3"], heading: float) -> float:
         assert visible is not None
         return visible(place * _Y, -heading)
 
-    return _boards(place_markers(mirrored_map(found), seed, config, None if visible is None else seen))
+    across = None if poses is None else _poses(poses)
+    return _boards(place_markers(mirrored_map(found), seed, config, None if visible is None else seen, across))
 
 
 def _boards(markers: PlacedMarkers) -> PlacedMarkers:

@@ -118,10 +118,10 @@ class Place:
 
 def _chosen_by_sight(
     vector_map: VectorMap, scene_id: int, config: WorldConfig, warp: Warp | None, mirror: bool
-) -> tuple[Visible, ...]:
+) -> Visible | None:
     """Return the visibility test by which boards are placed, on the map as it is shown, which determines the trees."""
     if config.markers.site != "clear":
-        return ()
+        return None
     shown = vector_map if warp is None else warped_map(vector_map, warp)
     seen = visible_places(mirrored_map(shown) if mirror else shown, scene_id, config.markers.size, on_left=mirror)
 
@@ -130,7 +130,7 @@ def _chosen_by_sight(
             place, heading = warp.moved(place), float(warp.turned(place[:2], np.asarray(heading)))
         return seen(place * [1.0, -1.0, 1.0], -heading) if mirror else seen(place, heading)
 
-    return (visible,)
+    return visible
 
 
 def simulate(
@@ -202,7 +202,8 @@ def simulate(
             network.map,
             scene_id,
             config.markers,
-            *_chosen_by_sight(network.map, scene_id, config, warp, mirror),
+            _chosen_by_sight(network.map, scene_id, config, warp, mirror),
+            global_from_ego,
         ),
     )
     return _shown(log, scene_id, config, warp, mirror)

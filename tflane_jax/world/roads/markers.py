@@ -29,6 +29,8 @@ _CLEAR = 2.0
 # Where a surveyor looks for a clear place: distances along the lane, and farther behind the kerb, metres. The first
 # place of which drivers see this fraction is taken.
 _AWAY, _FARTHER_BACK, _ENOUGH = (0.0, 3.0, 6.0, 10.0, 15.0, 20.0), 0.8, 0.98
+# Metres before a board at which drivers should see it, and to the side of the line along which its traffic comes.
+_NEAREST, _FARTHEST, _ASIDE = 8.0, 50.0, 15.0
 
 
 @dataclass(frozen=True)
@@ -37,7 +39,7 @@ class PlacementConfig:
 
     Attributes:
         per: "approach": a marker at every approach of a junction, split or merge; "scene": one of these per map, as in
-            the paper.
+            the paper: the one that most frames of the drive approach.
         side: "near": before the junction only; "both": also beyond it, to the right of the lanes that leave it, facing
             traffic that crosses the junction, which sees it from farther away and for longer.
         size: side of the black square, metres (paper: 1).
@@ -71,6 +73,7 @@ def place_markers(
     seed: int,
     config: PlacementConfig = PlacementConfig(),
     visible: Visible | None = None,
+    poses: Float[np.ndarray, "f 4 4"] | None = None,
 ) -> PlacedMarkers:
     """Return the markers of a map, in no particular order: to the right of each approach, facing its traffic.
 
@@ -83,6 +86,8 @@ def place_markers(
     Args:
         vector_map, seed, config: see above.
         visible: chooses among places along a lane; None takes the end of each lane.
+        poses: global_from_ego of the drive, for `per` "scene"; None, and markers that equally many frames approach, are
+            chosen among at random.
     """
     lanes = vector_map.segments
     ends = [(lanes[i], -1) for i in _approach_lanes(lanes)], [(lanes[i], 0) for i in _exit_lanes(lanes)]
@@ -95,9 +100,29 @@ def place_markers(
 
     rng = np.random.default_rng([ROOT, seed])
     number = rng.permutation(config.dictionary).astype(np.int32)
-    kept = rng.permutation(len(place))[: 1 if config.per == "scene" else config.dictionary]
+    kept = rng.permutation(len(place))
+    if config.per == "scene":
+        frames = [0 if poses is None else len(approaching(poses, place[i], float(heading[i]))) for i in kept]
+        kept = kept[np.argsort(np.negative(frames), kind="stable")[:1]]
+    kept = kept[: config.dictionary]
     facing = heading + np.pi - np.deg2rad(config.toe_in + rng.uniform(-config.jitter, config.jitter, len(place)))
     return PlacedMarkers(number[: len(kept)], marker_pose(place, facing)[kept], config.size)
+
+
+def approaching(
+    poses: Float[np.ndarray, "f 4 4"], place: Float[np.ndarray, "3"], heading: float
+) -> Int[np.ndarray, " k"]:
+    """Return the frames, by number, in which a vehicle drives towards a board from 50 to 8 m before it.
+
+    Args:
+        poses: global_from_ego.
+        place, heading: the board's middle, metres, and the heading of the traffic that it faces, radians.
+    """
+    away = poses[:, :2, 3] - place[:2]
+    before = -(away @ [np.cos(heading), np.sin(heading)])
+    aside = np.abs(away @ [-np.sin(heading), np.cos(heading)])
+    same_way = poses[:, :2, 0] @ [np.cos(heading), np.sin(heading)] > 0.5
+    return np.flatnonzero((before >= _NEAREST) & (before <= _FARTHEST) & (aside <= _ASIDE) & same_way)
 
 
 def marker_pose(place: Float[np.ndarray, "m 3"], facing: Float[np.ndarray, " m"]) -> Float[np.ndarray, "m 4 4"]:

@@ -323,6 +323,21 @@ def test_tokens_are_scaled_and_belong_to_their_lane(encoding, connectivity):
     assert np.array_equal(changed[0], tokens[0]) != connectivity
 
 
+@pytest.mark.parametrize("encoding", ["transformer", "mlp"])
+def test_only_the_transformer_models_interactions_of_points(encoding):
+    """Table IV: what moving two points of a line changes is the sum of what moving each changes, without interactions."""
+    module = MarkerTokens(replace(CONFIG, encoding=encoding), BASELINE.spec.bev_range)
+    guide = lanes_of(seeing(observed()))
+    variables = random_params(module.init, guide)
+    first, last = (jnp.zeros_like(guide.points).at[0, i].set(3.0) for i in (0, -1))
+    both, one, other, neither = (
+        np.asarray(module.apply(variables, guide.replace(points=guide.points + moved)), np.float64)[0]
+        for moved in (first + last, first, last, jnp.zeros_like(first))
+    )
+    assert np.abs(one - neither).max() > 1e-3
+    assert (np.abs(both - one - other + neither).max() < 1e-5) == (encoding == "mlp")
+
+
 def test_messages_follow_the_direction_of_edges():
     module, tokens = LaneNeighbours(8), jnp.eye(4, 8)
     edges = np.zeros((4, 4), bool)

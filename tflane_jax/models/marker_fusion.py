@@ -48,7 +48,8 @@ class MarkerFusionConfig:
         prior: confidence and polylines.
         memory: temporal memory; None for the ablation without (Table III).
         encoding: of a polyline (Table IV): "sine" is the transformer on Eq. (1), "transformer" the same on raw
-            coordinates, "mlp" a perceptron on all raw coordinates of a line.
+            coordinates, "mlp" a perceptron on each point's raw coordinates, whose outputs are joined as those of the
+            transformer are: "point-wise encoding", as the paper calls it, without interactions between points.
         lines: sizes of the transformer; `dim` is that of a token.
         fusion: "gated" is Eq. (3); "uniform" sets c = 1; "hard" sets c = 1 and ignores markers, seen or remembered,
             whose own confidence is below `hard_threshold` (Table II). c is only the factor in Eq. (3): confidence also
@@ -213,7 +214,8 @@ class MarkerTokens(nn.Module):
         count = points.shape[1]
         if config.encoding == "mlp":
             with computing(config.precision):
-                x = full(Mlp((config.lines.hidden, config.lines.dim), name="lines")(points.reshape(-1, count * 2)))
+                each = Mlp((config.lines.hidden, config.lines.dim), name="points")(points)
+                x = full(nn.Dense(config.lines.dim, name="lines")(each.reshape(-1, count * config.lines.dim)))
         else:
             sizes = config.lines if config.encoding == "sine" else replace(config.lines, bands=0)
             nothing = jnp.zeros((len(points), 0))

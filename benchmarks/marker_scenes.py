@@ -295,7 +295,7 @@ def run(out: Path, folder: Path | None, without: Path | None = None, scenes: int
     clock = Clock()
     scores, count = measure(model.source, model, None if without is None else opened(without, scenes), out, clock)
     table = scores_table(scores, count)
-    print(f"\n{scenes} scenes; every frame equals the composition of its parts\n\n{table}")
+    print(f"\n{scenes} scenes, scores of OpenLane-V2 v2.1; every frame equals the composition of its parts\n\n{table}")
     print(f"\n{clock}")
     record = {"machine": machine(), "model": None if folder is None else str(folder), "scenes": scenes}
     record |= {"frames": count, "scores": scores, "cpu_seconds": clock.frames}

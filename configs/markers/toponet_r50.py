@@ -7,7 +7,8 @@
 Section IV-C: ResNet-50 from ImageNet, 2048 x 1550 pixels with random resizing and colours, 200 x 100 BEV cells of half
 a metre, AdamW, a cosine of 24 epochs from 1e-4, one frame at a time. The paper gives no number of encoder layers:
 three, as TopoNet and OpenLane-V2's large baseline have, with Eq. (3) as written in each. A scene has one board. Ours:
-one clip of four frames for an update, the range of the resizing, and the clear place of a board. Of the 28 images of a
+one clip of four frames for an update, the range of the resizing, the clear place of a board, and, as the host's code
+has them, a tenth of the rate for the backbone and 500 updates of warm-up. Of the 28 images of a
 clip, one feature map of 256 channels at a quarter of the size takes 5.4 GiB, so that every part recomputes its
 activations, and the frames pass in a loop. Not trained.
 """

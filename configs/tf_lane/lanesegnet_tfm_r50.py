@@ -1,4 +1,4 @@
-"""LaneSegNet with the traffic-flow module at the papers' sizes: the main host of TF-Lane.
+"""LaneSegNet with the traffic-flow module at the papers' sizes: the host of TF-Lane's ablations.
 
     tflane summary --config tf_lane/lanesegnet_tfm_r50 --no-compile          # needs no data
     tflane convert --config tf_lane/lanesegnet_tfm_r50 --weights resnet50.pth --out runs/imagenet

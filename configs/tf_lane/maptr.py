@@ -5,6 +5,9 @@
 
 Same roads, encoder and optimizer as `toponet.py`, and the parts of the recipe of docs/small_models.md that a decoder of
 points can have. `:street_published` has the decoder's published forms and losses instead.
+
+`tflane tables tf_lane.3`, 2,000 updates of `:street`, eight seeds: mAP 59.5 ± 1.7, recall of hidden lines that vehicles
+drove along 76.3 ± 2.0 percent.
 """
 
 from dataclasses import replace

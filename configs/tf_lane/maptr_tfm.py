@@ -5,6 +5,9 @@
 
 Same data, optimizer and host as `maptr.py`; the settings of the module, and the names of the rows, are those of
 `toponet_tfm.py`. The ablations run on the preset `street`.
+
+`tflane tables tf_lane.3`, 2,000 updates, eight seeds, recall of hidden lines that vehicles drove along, percent:
+`:street` 76.4 ± 1.3 (control 76.3 ± 1.0), `:street_bev` 80.1 ± 1.4 (control 76.0 ± 1.6).
 """
 
 from pathlib import Path

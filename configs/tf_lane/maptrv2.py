@@ -9,6 +9,9 @@ queries, and the mask of lines in BEV. There are no cameras, so that depth and t
 `:street_published` has the decoder's published forms and losses instead, `:street_centerlines` the fourth class.
 `:argoverse2` learns lines with heights, as MapTRv2 does on Argoverse 2, from the two logs of `argoverse2.py`; one log
 of 32 frames shows that the program runs and says nothing about accuracy.
+
+`tflane tables tf_lane.4`, 1,500 updates of `:street`, eight seeds: mAP 52.1 ± 1.5, recall of hidden lines that vehicles
+drove along 70.5 ± 2.1 percent.
 """
 
 from dataclasses import fields, replace

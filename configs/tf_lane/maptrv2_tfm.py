@@ -5,6 +5,9 @@
 
 Same data, optimizer and host as `maptrv2.py`; the settings of the module, and the names of the rows, are those of
 `toponet_tfm.py`. The ablations run on the preset `street`.
+
+`tflane tables tf_lane.4`, 1,500 updates, eight seeds, recall of hidden lines that vehicles drove along, percent:
+`:street` 71.5 ± 1.9 (control 73.3 ± 1.1), `:street_bev` 77.3 ± 1.6 (control 71.5 ± 1.7).
 """
 
 from pathlib import Path

@@ -4,6 +4,9 @@
     tflane tables tf_lane.masking --jobs 2
 
 Everything but the masks is that of `toponet_tfm.py:street`, the paper's LT/LL with one softmax for each quadrant.
+
+The table, 2,500 updates, three seeds: recall of hidden lanes that vehicles drove along 49.3 to 51.0 percent, LT/LL
+49.6 ± 1.3; that a variant is better is not shown.
 """
 
 from dataclasses import replace
@@ -19,7 +22,7 @@ FAR = 1000.0
 
 
 def get_config() -> RunConfig:
-    """Return the paper's best masks: lanes attend to all valid instances, then to lanes (LT/LL)."""
+    """Return the masks of the paper's best row: lanes attend to all valid instances, then to lanes (LT/LL)."""
     return load_config(str(Path(__file__).with_name("toponet_tfm.py:street")))
 
 

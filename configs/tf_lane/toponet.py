@@ -3,8 +3,11 @@
     tflane train --config tf_lane/toponet
     tflane train --config tf_lane/toponet:street
 
-The second runs on simpler roads in a smaller box, where learned queries alone do better than lane proposals. Numbers
-and what each part of the recipe gives: docs/small_models.md.
+The second runs on simpler roads in a smaller box, where learned queries alone do better than lane proposals. What each
+part of the recipe gives: docs/small_models.md.
+
+`tflane tables tf_lane.2`, 2,500 updates of `:street`, eight seeds: DET_l 45.5 ± 0.8, recall of hidden lanes that
+vehicles drove along 50.6 ± 1.3 percent.
 """
 
 from dataclasses import replace

@@ -5,6 +5,9 @@
 
 Same data, optimiser and host as `toponet.py`: the preset `city`, and for all ablations `street`. The paper runs its
 ablations on LaneSegNet (`lanesegnet_tfm.py`); here they run on TopoNet.
+
+`tflane tables tf_lane.2`, 2,500 updates, eight seeds, recall of hidden lanes that vehicles drove along, percent:
+`:street` 50.3 ± 1.0 (control 49.8 ± 1.1), `:street_bev` 57.3 ± 1.0 (control 49.8 ± 0.8).
 """
 
 import dataclasses

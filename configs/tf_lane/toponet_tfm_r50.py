@@ -8,7 +8,7 @@
 Host, recipe and memory are those of `camera/toponet_r50`, with the same ablations `:remat`, `:bfloat16`, `:six_layers`
 and `:published_weights`, but for 60 epochs as TF-Lane trains all models; `:host` is the baseline without the module.
 Past frames come at 2 Hz, as key frames do. TF-Lane does not give the sizes of its module: it is as wide as the host
-here.
+here. It trains on 16 devices and gives no batch; here it is the host's.
 """
 
 from dataclasses import replace

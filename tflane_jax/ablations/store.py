@@ -17,7 +17,7 @@ from tflane_jax.training.provenance import listed_setting, read_provenance, thre
 from tflane_jax.training.records import read_records
 
 NAME_LENGTH = 16
-TOPOLOGY = {"all/TOP_ll", "all/TOP_lsls"}
+TOPOLOGY = {"all/TOP_ll", "all/TOP_ll_v1.0", "all/TOP_lsls"}
 
 
 def stored_jobs(

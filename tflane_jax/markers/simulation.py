@@ -45,7 +45,7 @@ class MarkerSimulationConfig:
         detection_sigma: sigma_d of P = exp(-d^2 / (2 sigma_d^2)), metres. The paper fits it but does not report it. The
             default puts P = 1/2 at 47 m, where a 1 m marker is 38 pixels wide in the front camera of Argoverse 2, some
             5 pixels for each of the 7 cells of a 5x5 ArUco marker.
-        range: largest distance at which a marker is visible, metres (the paper's curves end at 60 m).
+        range: largest distance at which a marker is visible, metres (the paper gives its errors at 60 m).
         field_of_view: full angle of view ahead, degrees.
         cameras: the whole square must lie in the image of one of them, with the calibration of the log; None asks for
             the field of view alone, which has no upper end.

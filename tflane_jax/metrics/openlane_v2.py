@@ -1,7 +1,8 @@
 """OpenLane-V2 centerline metrics: DET_l, DET_t, TOP_ll, TOP_lt and OLS, in both published versions.
 
 The topology score changed between devkit v1.0 and v1.1 (= v2.1) and differs by a factor of about four, so the version
-is part of every result: TF-Lane reports v2.1, the marker-fusion paper v1.0. DET is the same in both. Source:
+is part of every result. DET is the same in both. Neither TF-Lane nor the marker paper names its version: their numbers
+for TopoNet fit v2.1 and v1.0. Source:
 openlanev2/centerline/evaluation of the OpenLane-V2 devkit; docs/reference/metrics.md describes the rules. Recall, AP_l
 and the groups of lanes are this project's own (docs/metrics.md).
 """

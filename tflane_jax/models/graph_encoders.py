@@ -1,7 +1,7 @@
 """Graph encoders in place of LSTR's transformer encoder (GTN lane paper, section 2.1): GTN, GCN and HAN.
 
-The paper puts Graph Transformer Networks (docs/reference/gtn.md) into the encoding layer, compares GCN and HAN, and
-shares parameters between GNN and transformer; it gives no details. Our reading: an encoder layer keeps the
+The paper puts Graph Transformer Networks (docs/reference/gtn.md) into the encoding layer, names GCN and HAN as other
+methods, without numbers, and shares parameters between GNN and transformer; it gives no details. Our reading: an encoder layer keeps the
 transformer's structure (residual, norm, feed-forward, residual, norm), and graph convolution on learned meta-paths
 replaces self-attention. The nodes are the cells of the feature map, the edge types those of `layers.image_graph`.
 

@@ -1,7 +1,7 @@
 """Variants of TF-Lane's masks: which lanes see which road users, and which frames of a track see each other.
 
-The paper's M_s (Fig. 5) lets every lane attend to every valid instance. The restrictions here are composed with it by
-"and"; each is a setting of its own.
+By default every lane may attend to every valid instance; the paper names the quadrants L->T and T->L of M_s (Fig. 5)
+and does not define them. The restrictions here are composed with M_s by "and"; each is a setting of its own.
 """
 
 from __future__ import annotations

@@ -17,6 +17,8 @@ Choices that the paper leaves open (the first two are options):
   are: a token enters with its decayed confidence. "strongest" takes the same c and scales by Eq. (4) as written, so
   that a token enters with about the square. "one" leaves all scaling to Eq. (4).
 - T, gamma, alpha and epsilon are not given; the defaults are ours.
+- Slots are the last T frames, with or without markers; "the most recent T observations" may also mean frames with
+  markers.
 - With several markers in a frame, c_t is the highest confidence; lanes of the others are scaled relative to it.
 """
 

@@ -325,7 +325,7 @@ def test_tokens_are_scaled_and_belong_to_their_lane(encoding, connectivity):
 
 @pytest.mark.parametrize("encoding", ["transformer", "mlp"])
 def test_only_the_transformer_models_interactions_of_points(encoding):
-    """Table IV: what moving two points of a line changes is the sum of what moving each changes, without interactions."""
+    """Table IV: without interactions, moving two points of a line changes the sum of what moving each changes."""
     module = MarkerTokens(replace(CONFIG, encoding=encoding), BASELINE.spec.bev_range)
     guide = lanes_of(seeing(observed()))
     variables = random_params(module.init, guide)

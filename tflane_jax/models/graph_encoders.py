@@ -1,9 +1,10 @@
 """Graph encoders in place of LSTR's transformer encoder (GTN lane paper, section 2.1): GTN, GCN and HAN.
 
 The paper puts Graph Transformer Networks (docs/reference/gtn.md) into the encoding layer, names GCN and HAN as other
-methods, without numbers, and shares parameters between GNN and transformer; it gives no details. Our reading: an encoder layer keeps the
-transformer's structure (residual, norm, feed-forward, residual, norm), and graph convolution on learned meta-paths
-replaces self-attention. The nodes are the cells of the feature map, the edge types those of `layers.image_graph`.
+methods, without numbers, and shares parameters between GNN and transformer; it gives no details. Our reading: an
+encoder layer keeps the transformer's structure (residual, norm, feed-forward, residual, norm), and graph convolution on
+learned meta-paths replaces self-attention. The nodes are the cells of the feature map, the edge types those of
+`layers.image_graph`.
 
 Self-attention is one of the GTN's edge types, called similarity: its adjacency comes from the query and key projections
 of features + position, and the value and output projections are the weights of the graph convolution on all meta-paths.

@@ -153,8 +153,8 @@ TABLES = (
             },
         ),
         text="traffic flow improves TopoNet (+0.19 DET_l, +1.17 OLS)",
-        note="There is no DET_t, TOP_lt and OLS: BEV evidence shows no traffic elements, so this host predicts none. The "
-        "gains in the first claim are the paper's.",
+        note="There is no DET_t, TOP_lt and OLS: BEV evidence shows no traffic elements, so this host predicts none. "
+        "The gains in the first claim are the paper's.",
     ),
     _with_and_without(
         3,

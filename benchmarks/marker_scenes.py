@@ -8,8 +8,9 @@ residual, confidence, memory and model follow. Every frame is computed a second 
 must be the same. "boards withheld" is the same model without detections, `--without` another one, such as the host
 tuned without markers. Frames are "seen" (a board of the store was read), "gap" (none now, one before) or "before".
 
-Written are the table, the CPU time by part, and two pictures: the confidence of each frame, and gaps, with the last
-image that shows the board, the truth, the lanes in memory and those of each model.
+Written are the scores, what the boards change in recall with intervals over scenes, the CPU time by part, and two
+pictures: the confidence of each frame, and gaps, with the last image that shows the board, the truth, the lanes in
+memory and those of each model.
 
 `--tiny` takes random weights and one decoder layer and shows that everything runs; its scores mean nothing. A model
 whose scores mean something is a run of `markers/camera_clips:pixels` from a host of `markers/camera_host`
@@ -24,7 +25,7 @@ from __future__ import annotations
 
 import time
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -34,7 +35,8 @@ import numpy as np
 from tqdm import tqdm
 
 from benchmarks.marker_scene_pictures import Cell, Gap, Sighting, save_confidence, save_gaps, sighting
-from benchmarks.timing import command_line, machine, markdown_table, save
+from benchmarks.marker_scene_scores import differences, differences_table, scores_table
+from benchmarks.timing import command_line, machine, save
 from tflane_jax.config import load_config
 from tflane_jax.datasets.marker_cache import search_views
 from tflane_jax.datasets.marker_observations import store_of_log
@@ -64,7 +66,6 @@ from tflane_jax.world.cameras.sensor import render_cameras
 
 CONFIG = "markers/camera_clips:pixels"
 WITH, WITHHELD, WITHOUT = "markers", "boards withheld", "model without markers"
-SCORES = ("recall", "DET_l", "TOP_ll")
 
 
 class Frame(NamedTuple):
@@ -201,8 +202,8 @@ def _check(step: DriveStep, example: Example, guidance: MarkerGuidance, answer: 
 
 def measure(
     source: ProceduralConfig, model: DriveModel, other: DriveModel | None, out: Path, clock: Clock
-) -> tuple[dict[str, dict[str, dict[str, float]]], dict[str, int]]:
-    """Drive through the scenes, draw pictures, and return scores by row and group, and the frames of each group."""
+) -> tuple[dict[str, LaneGraphMetrics], dict[str, int]]:
+    """Drive through the scenes, draw pictures, and return the metrics of each model and the frames of each group."""
     markers = source.example.markers
     if markers is None or model.task.model.priors.markers is None or source.example.cameras is None:
         raise UserError(f"this model reads no markers in images: take a run of {CONFIG}")
@@ -252,7 +253,7 @@ def measure(
     print("\nwritten to", save_confidence(out / "marker_scenes_confidence.png", cells, drive.interval))
     picture = save_gaps(out / "marker_scenes_gaps.png", gaps, source)
     print("no picture of gaps: no board was seen and then lost" if picture is None else f"written to {picture}")
-    return {name: metric.compute() for name, metric in metrics.items()}, count
+    return metrics, count
 
 
 def tiny(scenes: int) -> DriveModel:
@@ -293,25 +294,16 @@ def run(out: Path, folder: Path | None, without: Path | None = None, scenes: int
     """Print and write table and pictures of a run, of random weights without one; return the record."""
     model = tiny(scenes) if folder is None else opened(folder, scenes)
     clock = Clock()
-    scores, count = measure(model.source, model, None if without is None else opened(without, scenes), out, clock)
-    table = scores_table(scores, count)
+    measured, count = measure(model.source, model, None if without is None else opened(without, scenes), out, clock)
+    scores = {name: metric.compute() for name, metric in measured.items()}
+    above = differences({name: metric.ratios() for name, metric in measured.items()}, WITH)
+    table = f"{scores_table(scores, count)}\n\n{differences_table(above)}"
     print(f"\n{scenes} scenes, scores of OpenLane-V2 v2.1; every frame equals the composition of its parts\n\n{table}")
     print(f"\n{clock}")
     record = {"machine": machine(), "model": None if folder is None else str(folder), "scenes": scenes}
-    record |= {"frames": count, "scores": scores, "cpu_seconds": clock.frames}
+    record |= {"frames": count, "scores": scores, "recall differences": above, "cpu_seconds": clock.frames}
     save(out, "marker_scenes", record, f"{table}\n\n{clock}")
     return record
-
-
-def scores_table(scores: Mapping[str, Mapping[str, Mapping[str, float]]], count: Mapping[str, int]) -> str:
-    """Return a row for each group of frames and model, in percent; groups without frames are left out."""
-    groups = {"all": sum(count.values())} | {group: n for group, n in count.items() if n}
-    rows = [
-        [group, str(n), name, *(f"{100 * of_model[group][score]:.1f}" for score in SCORES)]
-        for group, n in groups.items()
-        for name, of_model in scores.items()
-    ]
-    return markdown_table(["frames", "number", "model", *SCORES], rows)
 
 
 def main() -> None:

@@ -10,6 +10,7 @@ from benchmarks import (
     marker_composites,
     marker_occlusion,
     marker_scene_pictures,
+    marker_scene_scores,
     marker_scenes,
 )
 from tests.models.cases import CAMERA_TOPONET, make_camera_example
@@ -17,6 +18,7 @@ from tests.models.test_marker_fusion import CONFIG as MARKERS
 from tests.parameters import random_params
 from tflane_jax.datasets.base import ExampleConfig
 from tflane_jax.datasets.procedural import ProceduralConfig
+from tflane_jax.evaluation.results import SceneRatio
 from tflane_jax.markers.detection import DetectedMarkers
 from tflane_jax.markers.image_search import DetectorConfig
 from tflane_jax.markers.pixels import PixelConfig
@@ -109,6 +111,21 @@ def test_a_sighting_is_the_nearest_board_that_gives_lanes():
     assert marker_scene_pictures.sighting(views, None, step({4: "stale", 5: "unknown", 6: "dropped"})) is None
 
 
+def test_what_boards_change_is_told_with_intervals_over_scenes():
+    """Three scenes of 30 lanes at three thresholds; in gaps the second one has none, and the boards bring 2 a scene."""
+    ratios = {
+        "with": {"all/recall": SceneRatio((10, 20, 30), (90, 90, 90)), "gap/recall": SceneRatio((5, 0, 5), (9, 0, 9))},
+        "same": {"all/recall": SceneRatio((10, 20, 30), (90, 90, 90)), "gap/recall": SceneRatio((3, 0, 3), (9, 0, 9))},
+    }
+    overall, gap = marker_scene_scores.differences(ratios, "with")
+    assert (overall["difference"], overall["low"], overall["high"]) == (0.0, 0.0, 0.0)
+    assert (gap["frames"], gap["scenes"], gap["against"]) == ("gap", 2, "same")
+    assert gap["difference"] == pytest.approx(4 / 18)
+    assert gap["high"] == pytest.approx(4 / 18)
+    assert gap["low"] in (0.0, pytest.approx(4 / 18))  # a sample may have the scene without gaps alone
+    assert "+22.2" in marker_scene_scores.differences_table([gap])
+
+
 @pytest.mark.slow
 def test_rendered_drives_are_scored_with_and_without_their_boards(tmp_path, monkeypatch):
     """A random model of two cameras, on two short scenes."""
@@ -125,7 +142,8 @@ def test_rendered_drives_are_scored_with_and_without_their_boards(tmp_path, monk
         example=ExampleConfig(range=model.range, sensor=None, cameras=rig, markers=markers),
     )
     drive = DriveModel(task, random_params(task.init, make_camera_example()), source)
-    scores, frames = marker_scenes.measure(source, drive, drive, tmp_path, marker_scenes.Clock())
+    measured, frames = marker_scenes.measure(source, drive, drive, tmp_path, marker_scenes.Clock())
+    scores = {name: metric.compute() for name, metric in measured.items()}
     assert sum(frames.values()) == 6
     assert (tmp_path / "marker_scenes_confidence.png").is_file()
     assert list(scores) == [marker_scenes.WITH, marker_scenes.WITHHELD, marker_scenes.WITHOUT]

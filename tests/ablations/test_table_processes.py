@@ -68,46 +68,55 @@ if __name__ == "__main__":
 """
 
 
-@pytest.fixture
-def start(tmp_path):
-    """Return a function that starts the tiny table, two trainings at a time, in a folder."""
-    (tmp_path / "tiny.py").write_text(CONFIG)
-    (tmp_path / "script.py").write_text(SCRIPT)
+BEGUN, SAVED, COMPLETE = "runs/*/config.json", "runs/*/checkpoints/step_*", f"runs/*/checkpoints/step_{STEPS:08d}"
 
-    settings = {"PYTHONPATH": str(ROOT), "JAX_PLATFORMS": "cpu", "TFLANE_CACHE": str(tmp_path / "cache")}
+
+@pytest.fixture(scope="module")
+def start(tmp_path_factory):
+    """Return a function that starts the tiny table, two trainings at a time, in a folder; its messages lie beside."""
+    folder = tmp_path_factory.mktemp("tiny")
+    (folder / "tiny.py").write_text(CONFIG)
+    (folder / "script.py").write_text(SCRIPT)
+    settings = {"PYTHONPATH": str(ROOT), "JAX_PLATFORMS": "cpu", "TFLANE_CACHE": str(folder / "cache")}
 
     def started(out):
-        command = [sys.executable, str(tmp_path / "script.py"), str(tmp_path / "tiny.py"), str(out)]
-        with open(tmp_path / "messages.txt", "a") as file:
+        command = [sys.executable, str(folder / "script.py"), str(folder / "tiny.py"), str(out)]
+        with open(messages(out), "a") as file:
             return subprocess.Popen(command, env=os.environ | settings, stdout=file, stderr=file)
 
     return started
 
 
-def messages(folder):
-    return (folder / "messages.txt").read_text()
+@pytest.fixture(scope="module")
+def whole(start, tmp_path_factory):
+    """Return the folder of the table that nothing stopped."""
+    out = tmp_path_factory.mktemp("whole") / "tables"
+    assert start(out).wait() == 0, messages(out).read_text()
+    return out
 
 
-def test_a_table_that_was_killed_ends_with_the_same_bytes(start, tmp_path):
-    whole, parts = tmp_path / "whole", tmp_path / "parts"
-    first = start(whole)
-    assert first.wait() == 0, messages(tmp_path)
+def messages(out):
+    return out.with_suffix(".txt")
 
+
+@pytest.mark.parametrize("moment", [BEGUN, SAVED, COMPLETE], ids=["before a checkpoint", "after one", "after a run"])
+def test_a_table_that_was_killed_ends_with_the_same_bytes(start, whole, tmp_path, moment):
+    parts = tmp_path / "parts"
     killed = start(parts)
-    while not list(parts.glob("runs/*/checkpoints/step_*")):
-        assert killed.poll() is None, messages(tmp_path)
+    while not list(parts.glob(moment)):
+        assert killed.poll() is None, messages(parts).read_text()
         time.sleep(0.05)
     killed.send_signal(signal.SIGKILL)
     killed.wait()
-    begun = [path.parent for path in parts.glob("runs/*/config.json")]
+    begun = [path.parent for path in parts.glob(BEGUN)]
     while any(is_locked(run) for run in begun):  # until its workers have ended
         time.sleep(0.1)
-    assert not any((run / "checkpoints" / f"step_{STEPS:08d}").exists() for run in begun)
+    assert len(list(parts.glob(COMPLETE))) < 4
 
     again = start(parts)
-    assert again.wait() == 0, messages(tmp_path)
-    for name in ("table.md", "table.json", "table.tex"):
-        assert (parts / "paper.9" / name).read_bytes() == (whole / "paper.9" / name).read_bytes()
+    assert again.wait() == 0, messages(parts).read_text()
+    for name in ("table.md", "table.json", "table.tex", "curves.png"):
+        assert (parts / "paper.9" / name).read_bytes() == (whole / "paper.9" / name).read_bytes(), name
     # But for the time of the declaration, the tests are the same, too.
     effects = [(out / "paper.9" / "effects.md").read_text() for out in (whole, parts)]
     dates = [json.loads((out / "paper.9" / "declaration.json").read_text())["time"] for out in (whole, parts)]

@@ -273,6 +273,33 @@ def test_invalid_config_files_are_named(tmp_path, content, message):
     assert str(path) in str(error.value)
 
 
+@pytest.mark.parametrize("folder", ["", "sub/"])
+def test_the_line_of_an_error_is_named_for_relative_paths_too(folder, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "sub").mkdir()
+    Path(f"{folder}own.py").write_text("def get_config():\n    return 1 / 0\n")
+    with pytest.raises(UserError, match=rf"config file {folder}own\.py, line 2: ZeroDivisionError"):
+        load_config(f"{folder}own.py")
+
+
+@pytest.mark.parametrize("ablation", ["", ":wrong"])
+@pytest.mark.parametrize(
+    ("setting", "allowed"),
+    [("optim", "OptimConfig"), ("training", "TrainingConfig"), ("task", "LaneGraphTask or LaneShapeTask")],
+)
+def test_a_part_of_the_wrong_type_is_named_with_its_line(setting, allowed, ablation, tmp_path):
+    path = tmp_path / "own.py"
+    path.write_text(
+        "from tflane_jax.config import RunConfig\n\n\ndef get_config():\n"
+        f"    return RunConfig({setting}={{'lr': 1e-3}})\n\n\n"
+        "def ablations():\n    return {'wrong': get_config(), 'number': 3}\n"
+    )
+    with pytest.raises(UserError, match=rf"own\.py, line 5: {setting} is {{'lr': 0\.001}}: it must be {allowed}"):
+        load_config(f"{path}{ablation}")
+    with pytest.raises(UserError, match=r"ablation number of config file .*own\.py is a int, not a RunConfig"):
+        load_config(f"{path}:number")
+
+
 @pytest.mark.parametrize(
     ("name", "ablation"), [("tf_lane/toponet_tfm", ""), ("tf_lane/toponet_tfm", ":abla1"), ("markers/host", "")]
 )

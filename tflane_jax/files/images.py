@@ -106,6 +106,17 @@ def read_image(path: Path) -> UInt8[np.ndarray, "h w 3"]:
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
+def check_centre(path: Path, image: UInt8[np.ndarray, "h w 3"], intrinsics: Float[np.ndarray, "3 3"]) -> None:
+    """Raise UserError if the principal point is outside an image, which then has another size than the calibration."""
+    height, width = image.shape[:2]
+    x, y = intrinsics[:2, 2]
+    if not (0.0 <= x <= width and 0.0 <= y <= height):
+        raise UserError(
+            f"{path} is {width} x {height}, but the principal point is ({x:g}, {y:g}): are the intrinsics of another "
+            "image size?"
+        )
+
+
 def undistorted(
     image: UInt8[np.ndarray, "h w 3"], intrinsics: Float[np.ndarray, "3 3"], distortion: Sequence[float]
 ) -> UInt8[np.ndarray, "h w 3"]:

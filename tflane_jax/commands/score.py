@@ -10,7 +10,7 @@ from typing import Any
 
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import check_stem
-from tflane_jax.plots.tables import format_table, save_table
+from tflane_jax.plots.tables import format_table, save_table, written_to
 from tflane_jax.scoring import remarks as about
 from tflane_jax.scoring.protocols import ScoringProtocol, find_protocol
 from tflane_jax.scoring.scenes import read_scenes, scene_names
@@ -59,7 +59,7 @@ def run(options: argparse.Namespace) -> int:
         "remarks": remarks,
     }
     paths = save_table(options.out, rows, meta, columns=shown, title=title, digits=4)
-    print(f"\nwritten to {paths[0]} and {paths[1]}")
+    print(f"\n{written_to(paths)}")
     return 0
 
 

@@ -35,7 +35,7 @@ from tflane_jax.training.runtime import configure_jax
 from tflane_jax.training.schedule import make_optimizer, scaled_to_batch
 from tflane_jax.training.sharding import laid_out
 from tflane_jax.training.state import init_state
-from tflane_jax.training.step import make_update_step
+from tflane_jax.training.step import UpdateForm, make_update_step
 
 DEVICES = (1, 2, 8)
 KINDS_OF_EXCHANGE: tuple[str, ...] = ("all-reduce", "all-gather", "reduce-scatter", "all-to-all", "collective-permute")
@@ -78,7 +78,7 @@ def planned(config: RunConfig, examples: int, *, shard: bool) -> dict[str, Any]:
         batch = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=parts), batch)
     began = time.process_time()
     with active(mesh):
-        update: Any = make_update_step(task, optim, STEPS, mesh=mesh, shard_state=shard)
+        update: Any = make_update_step(task, optim, STEPS, UpdateForm(mesh=mesh, shard_state=shard))
         program = update.lower(state, batch).compile()
     memory = program.memory_analysis()
     return {

@@ -36,7 +36,7 @@ from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.training.runtime import configure_jax
 from tflane_jax.training.schedule import make_optimizer
 from tflane_jax.training.state import init_states
-from tflane_jax.training.step import compiled_update, update_all
+from tflane_jax.training.step import UpdateForm, compiled_update, update_all
 
 ROOT = Path(__file__).parent.parent
 CONFIGS = {"baseline": "tf_lane/toponet:street", "+TFM": "tf_lane/toponet_tfm:street"}
@@ -130,7 +130,7 @@ def _updates(config: RunConfig, batch: Example, count: int) -> Compiled:
     """Return the update of `count` seeds, as a training makes it: every call goes on from the one before."""
     states = init_states(config.task, make_optimizer(config.optim, STEPS), range(count), _first(batch))
     start = os.times().elapsed
-    update = compiled_update(config.task, config.optim, STEPS, states[0], batch, donate=count == 1)
+    update = compiled_update(config.task, config.optim, STEPS, states[0], batch, UpdateForm(donate=count == 1))
     seconds = os.times().elapsed - start
 
     def step() -> Any:

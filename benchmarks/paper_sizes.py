@@ -26,7 +26,8 @@ from typing import Any
 
 from benchmarks.timing import command_line, machine, markdown_table, save
 from tflane_jax.cli import main as tflane
-from tflane_jax.config import NuScenesData, OpenLaneV2Data, RunConfig, WorldData, apply_overrides, load_config
+from tflane_jax.config import NuScenesData, OpenLaneV2Data, RunConfig, WorldData, load_config
+from tflane_jax.config_overrides import apply_overrides
 from tflane_jax.models.bev_encoder import BevFormerConfig
 from tflane_jax.models.camera_encoder import CameraEncoderConfig
 from tflane_jax.runs import train_run

@@ -43,6 +43,7 @@ FLOORS = (
     "tasks",
     "convert",
     "config",
+    "config_overrides",
     "run_checks training_nearness",
     "runs",
     "summary export",

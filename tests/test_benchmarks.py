@@ -24,8 +24,9 @@ from benchmarks.gpu import matching, steps
 from benchmarks.timing import command_line, compile_jax, interleave, markdown_table, summarise
 from tests.shared import ROOT
 from tflane_jax.ablations.paper.tf_lane import MASKING
-from tflane_jax.config import WorldData, apply_overrides, load_config
+from tflane_jax.config import WorldData, load_config
 from tflane_jax.config_io import to_text
+from tflane_jax.config_overrides import apply_overrides
 from tflane_jax.models.parameters import split_statistics
 from tflane_jax.run_checks import check_run
 from tflane_jax.runs import check_origin

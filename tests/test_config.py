@@ -12,10 +12,10 @@ from typing import Literal
 import pytest
 
 from tests.shared import ROOT
-from tflane_jax.config import LogData, OpenLaneV2Data, RunConfig, apply_overrides, load_ablations, load_config
-from tflane_jax.config import _with_reference_batch as with_reference_batch
+from tflane_jax.config import LogData, OpenLaneV2Data, RunConfig, load_ablations, load_config, with_reference_batch
 from tflane_jax.config_files import shipped_configs
 from tflane_jax.config_io import from_json, settings, to_json, to_text
+from tflane_jax.config_overrides import apply_overrides
 from tflane_jax.errors import UserError
 from tflane_jax.markers.simulation import MarkerConfig, MarkerSimulationConfig
 from tflane_jax.models.marker_fusion import MarkerFusionConfig

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from scipy.optimize import linear_sum_assignment
 
+from tests.converted import converted_params
 from tests.golden import ModuleCase, golden_entries, implemented, load_module_case, numbered, options
 from tests.golden_compare import compare
 from tests.layers import test_attention_golden, test_bev_attention, test_deformable, test_transformer
@@ -19,6 +20,7 @@ from tests.layers.test_graph_transformer import check as check_graph_transformer
 from tests.losses.test_costs import check_assignment
 from tests.models import test_bevformer_golden, test_sd_map_golden
 from tests.models.golden_bev import aligned, bev_config
+from tflane_jax.convert.sd_map import SD_MAP_ENCODER
 from tflane_jax.models.sd_map_encoder import SdMapEncoder
 
 pytestmark = pytest.mark.golden
@@ -155,7 +157,7 @@ def test_a_map_encoder_without_categories():
     silenced = case.params | {"map_embedding.weight": np.where(np.arange(weight.shape[1]) < width, weight, 0.0)}
     found = {}
     config, limits = test_sd_map_golden.encoder_config(case)
-    variables = {"params": test_sd_map_golden.convert_sd_map_encoder(silenced).variables["params"]}
+    variables = {"params": converted_params(silenced, SD_MAP_ENCODER)}
     for name in names:
         lines = case.inputs[name]
         sd_map = test_sd_map_golden.SdMap(lines, np.zeros(len(lines), np.int32), np.ones(len(lines), bool))

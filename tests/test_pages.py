@@ -10,7 +10,8 @@ import pytest
 
 from tests.shared import ROOT
 from tflane_jax.cli import build_parser
-from tflane_jax.config import RunConfig, apply_overrides, load_config
+from tflane_jax.config import RunConfig, load_config
+from tflane_jax.config_overrides import apply_overrides
 from tflane_jax.errors import UserError
 from tflane_jax.runs import check_origin
 

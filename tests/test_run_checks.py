@@ -10,8 +10,9 @@ import pytest
 
 from tflane_jax import devices, runs
 from tflane_jax.cli import main
-from tflane_jax.config import RunConfig, apply_overrides, load_config
+from tflane_jax.config import RunConfig, load_config
 from tflane_jax.config_io import with_setting
+from tflane_jax.config_overrides import apply_overrides
 from tflane_jax.datasets import sources
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import PerceptionRange

@@ -1,4 +1,4 @@
-"""A run's configuration, assembled from those of its parts; configuration files and overrides.
+"""A run's configuration, assembled from those of its parts, and configuration files.
 
 A config file is Python with `get_config() -> RunConfig` and optionally `ablations() -> dict[str, RunConfig]`.
 """
@@ -10,7 +10,6 @@ import contextlib
 import dataclasses
 import difflib
 import importlib.util
-import io
 import re
 import traceback
 from collections.abc import Sequence
@@ -19,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 from tflane_jax.config_files import find_config, split_reference
-from tflane_jax.config_io import choices, part_classes, settings, with_setting
+from tflane_jax.config_io import part_classes
 from tflane_jax.datasets.argoverse2 import LogData
 from tflane_jax.datasets.front_views import FrontViewData
 from tflane_jax.datasets.nuscenes import NuScenesData
@@ -58,10 +57,8 @@ __all__ = [
     "SceneFileData",
     "TuSimpleData",
     "WorldData",
-    "apply_overrides",
     "load_ablations",
     "load_config",
-    "override_names",
 ]
 
 
@@ -101,7 +98,7 @@ def load_config(reference: str) -> RunConfig:
     name, ablation = split_reference(reference)
     if not ablation:
         config = _run_function(find_config(name), "get_config", RunConfig)
-        return _checked(find_config(name), _with_reference_batch(config, config))
+        return _checked(find_config(name), with_reference_batch(config, config))
     ablations = load_ablations(name)
     if ablation not in ablations:
         close = difflib.get_close_matches(ablation, ablations, 3)
@@ -111,10 +108,10 @@ def load_config(reference: str) -> RunConfig:
     config = ablations[ablation]
     if not isinstance(config, RunConfig):
         raise UserError(f"ablation {ablation} of config file {name} is a {type(config).__name__}, not a RunConfig")
-    return _checked(find_config(name), _with_reference_batch(config, config))
+    return _checked(find_config(name), with_reference_batch(config, config))
 
 
-def _with_reference_batch(config: RunConfig, chosen: RunConfig) -> RunConfig:
+def with_reference_batch(config: RunConfig, chosen: RunConfig) -> RunConfig:
     """Return a configuration whose learning rate is scaled, if it is, from the batch of the one it was chosen for."""
     if not (isinstance(config.optim, OptimConfig) and isinstance(chosen.training, TrainingConfig)):
         return config  # of a file; its check names the type
@@ -218,92 +215,5 @@ def _lines_of(path: Path, error: SettingError) -> str:
     return f", line {' or '.join(str(k.lineno) for k in written)}" if written else ""
 
 
-def apply_overrides(config: RunConfig, arguments: Sequence[str]) -> RunConfig:
-    """Return the configuration with settings changed by `--a.b.c value` arguments, typed by tyro.
-
-    A learning rate that is scaled without `optim.reference_batch` was chosen for the batch of `config`.
-
-    An argument that chooses an optional part, or the class of a part, is applied first, wherever it appears:
-    `--a.b None`, `--a.b default` or `--a.b NameOfItsClass`; the part then has its defaults.
-
-    Raises:
-        UserError: an unknown setting (with the names closest to it), a value of the wrong type, or one that breaks a
-            limit.
-    """
-    if not arguments:
-        return config
-    import tyro
-
-    given = config
-    config, arguments = _choose_parts(config, arguments)
-    _check_names(config, arguments)
-    output = io.StringIO()
-    try:
-        with contextlib.redirect_stderr(output), contextlib.redirect_stdout(output):
-            changed = tyro.cli(RunConfig, default=config, args=list(arguments), config=(tyro.conf.AvoidSubcommands,))
-    except SystemExit as error:
-        raise UserError(_without_boxes(output.getvalue())) from error
-    changed = _with_reference_batch(changed, given)
-    check_settings(changed, "--")
-    return changed
-
-
-def override_names(config: RunConfig) -> list[str]:
-    """Return the dotted names of all settings that arguments can change."""
-    return [name for name, value in settings(config) if not dataclasses.is_dataclass(value)]
-
-
-def _choose_parts(config: RunConfig, arguments: Sequence[str]) -> tuple[RunConfig, list[str]]:
-    """Return the configuration with the chosen parts, and the remaining arguments."""
-    left = list(arguments)
-    while chosen := [i for i, argument in enumerate(left) if choices(config, _setting(argument))]:
-        # Outer parts before inner ones.
-        at = min(chosen, key=lambda i: _setting(left[i]).count("."))
-        name, kinds = _setting(left[at]), choices(config, _setting(left[at]))
-        _, equals, value = left.pop(at).partition("=")
-        if not equals:
-            value = left.pop(at) if at < len(left) else ""
-        if value not in kinds:
-            raise UserError(
-                f"setting --{name} takes {', '.join(kinds)}, not {value!r}; its own settings are --{name}..."
-            )
-        try:
-            config = with_setting(config, name, kinds[value]())
-        except TypeError:
-            raise UserError(f"{value} has no defaults for all of its settings: choose it in a config file") from None
-    return config, left
-
-
-def _setting(argument: str) -> str:
-    """Return the name of the setting that an argument changes; "" for a value."""
-    return argument.partition("=")[0].removeprefix("--").replace("-", "_") if argument.startswith("--") else ""
-
-
-def _check_names(config: RunConfig, arguments: Sequence[str]) -> None:
-    known = override_names(config)
-    for argument in arguments:
-        name = _setting(argument)
-        if name and name not in known and name.replace(".no_", ".") not in known:
-            close = _closest(name, known)
-            hint = f"did you mean {' or '.join(f'--{c}' for c in close)}?" if close else "see --help for all settings"
-            raise UserError(f"unknown setting --{name}: {hint}")
-
-
 def _did_you_mean(close: Sequence[str]) -> str:
     return f"; did you mean {' or '.join(close)}?" if close else ""
-
-
-def _closest(name: str, known: list[str]) -> list[str]:
-    """Return up to three similar names: compared as a whole, else by their last parts."""
-    whole = difflib.get_close_matches(name, known, 3, 0.75)
-    last = name.rpartition(".")[2]
-    parts = difflib.get_close_matches(last, sorted({k.rpartition(".")[2] for k in known}), 3, 0.75)
-    return (whole or [k for part in parts for k in known if k.rpartition(".")[2] == part])[:3]
-
-
-def _without_boxes(text: str) -> str:
-    """Return tyro's error message as one line, without frame, title and hints."""
-    # tyro prints a title, a rule (unless framed), the message, a rule, hints.
-    lines = [re.sub(r"[│─╭╮╰╯]|-{3,}", " ", line).strip() for line in text.splitlines()[1:]]
-    paragraphs = re.split(r"\n{2,}", "\n".join(lines).strip())
-    return paragraphs[0].replace("\n", " ")

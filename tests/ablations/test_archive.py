@@ -105,7 +105,7 @@ def trainings(monkeypatch):
 
 
 def test_a_table_from_its_record_is_that_of_its_runs(tiny, made, tmp_path, monkeypatch, capsys):
-    forbid(monkeypatch, "workers.train_run", "scores.open_run", "compare.open_run")
+    forbid(monkeypatch, "workers.train_run", "scores.open_run", "finished_runs.open_run")
     monkeypatch.setattr("tflane_jax.ablations.scores.code_digest", lambda: OTHER_CODE)
     monkeypatch.setattr("tflane_jax.ablations.table_plan.worker_threads", lambda *_: {"cores": 96})
     results = made.with_name("results")

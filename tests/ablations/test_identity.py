@@ -11,7 +11,8 @@ from tflane_jax.ablations import workers
 from tflane_jax.ablations.jobs import Job, file_names
 from tflane_jax.ablations.scores import code_digest, measure, with_test_set
 from tflane_jax.cli import main
-from tflane_jax.config import RunConfig, apply_overrides, load_config
+from tflane_jax.config import RunConfig, load_config
+from tflane_jax.config_overrides import apply_overrides
 from tflane_jax.errors import UserError
 from tflane_jax.training.records import read_records
 

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from tests.golden import golden_entries, load_module_case
-from tflane_jax.convert.hosts import load_host
+from tflane_jax.convert.hosts import convert_host, load_host
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import BevGrid
 from tflane_jax.layers.fpn import FeaturePyramidConfig
+from tflane_jax.layers.polyline_encoder import PolylineEncoderConfig
 from tflane_jax.layers.resnet import ResNetConfig
 from tflane_jax.models.area_decoder import AreaDecoderConfig
 from tflane_jax.models.bev_encoder import BevFormerConfig
@@ -24,6 +25,8 @@ from tflane_jax.models.lift import LiftConfig
 from tflane_jax.models.map_lines import LineDecoderConfig
 from tflane_jax.models.maptr import MapTrConfig
 from tflane_jax.models.maptrv2 import MapTrV2Config
+from tflane_jax.models.priors import PriorsConfig
+from tflane_jax.models.sd_map_encoder import SdMapModuleConfig
 from tflane_jax.models.toponet import TopoNetConfig
 
 ENCODER = CameraEncoderConfig(
@@ -147,6 +150,22 @@ def maptr(attention):
     return MapTrConfig(encoder=CameraEncoderConfig(images, bev), decoder=decoder)
 
 
+def smerf_checkpoint():
+    """Return TopoNet's tensors with SMERF's map encoder, as wide as the BEV features, and its BEV constructer."""
+    state = {name: value for name, value in checkpoint("toponet_head").items() if "bev_constructor" not in name}
+    state |= fixture("smerf_bev_constructer", "bev_constructor.")
+    for name, value in fixture("smerf_map_graph_transformer", "map_encoder.").items():
+        state[name] = np.ones(tuple({32: 16, 96: 48}.get(size, size) for size in value.shape), np.float32)
+    return state
+
+
+SMERF = dataclasses.replace(
+    TOPONET,
+    encoder=dataclasses.replace(
+        ENCODER, bev=dataclasses.replace(ENCODER.bev, grid=BevGrid(rows=4, columns=6), hidden=24, value_projections=2)
+    ),
+    priors=PriorsConfig(sd_map=SdMapModuleConfig(lines=PolylineEncoderConfig(dim=16, layers=2, hidden=16))),
+)
 BUCKET = dataclasses.replace(
     LANESEGNET,
     decoder=dataclasses.replace(LANESEGNET.decoder, classes=1),
@@ -155,6 +174,7 @@ BUCKET = dataclasses.replace(
 )
 CASES = {
     "toponet": (TOPONET, lambda: checkpoint("toponet_head")),
+    "toponet, smerf": (SMERF, smerf_checkpoint),
     "baseline": (BASELINE, lambda: checkpoint("olv2_lc_head", ("lclc_head", "lcte_head"))),
     "lanesegnet": (LANESEGNET, lanesegnet_checkpoint),
     "lanesegnet, bucket": (BUCKET, bucket_checkpoint),
@@ -197,3 +217,16 @@ def test_every_tensor_of_a_detector_has_its_place(name, tmp_path):
     np.savez(path, **state, **{"pts_bbox_head.surplus.weight": np.zeros(3)})
     with pytest.raises(UserError, match="is no tensor of"):
         load_host(path, model)
+
+
+@pytest.mark.golden
+def test_norms_of_smerf_are_numbered_with_that_of_the_map():
+    state = smerf_checkpoint()
+    layer = convert_host(state, SMERF).variables["params"]["encoder"]["bev"]["encoder"]["layer_0"]
+    norms = [state[f"bev_constructor.encoder.layers.0.norms.{i}.weight"] for i in (2, 3)]
+    np.testing.assert_array_equal(layer["sd_map_0"]["norm"]["scale"], norms[0])
+    np.testing.assert_array_equal(layer["feed_forward_norm"]["scale"], norms[1])
+    with pytest.raises(
+        UserError, match=r"map_encoder.* is no tensor of TopoNet|attentions.2.* is no tensor of TopoNet"
+    ):
+        convert_host(state, TOPONET)

@@ -20,8 +20,9 @@ from tests.datasets.nuscenes_small import (
     write_nuscenes,
 )
 from tflane_jax.cli import main
-from tflane_jax.config import RunConfig, SceneFileData, apply_overrides
+from tflane_jax.config import RunConfig, SceneFileData
 from tflane_jax.config_io import from_json, to_json
+from tflane_jax.config_overrides import apply_overrides
 from tflane_jax.datasets.base import ExampleConfig
 from tflane_jax.datasets.batches import batches
 from tflane_jax.datasets.map_lines import MapLinesConfig

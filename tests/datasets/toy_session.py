@@ -31,8 +31,9 @@ def main(listed: Path, folder: Path) -> None:
 
 def configuration(data: Path) -> None:
     from tests.datasets.toy_source import ToyData
-    from tflane_jax.config import RunConfig, apply_overrides
+    from tflane_jax.config import RunConfig
     from tflane_jax.config_io import from_json, to_json
+    from tflane_jax.config_overrides import apply_overrides
 
     config = RunConfig(data=ToyData(data))
     assert from_json(RunConfig, json.loads(json.dumps(to_json(config)))) == config

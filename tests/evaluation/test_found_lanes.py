@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from tests.fakes import fake_example
+from tests.metrics.definitions import all_pairs, frechet
 from tflane_jax.evaluation.found_lanes import (
     WITHIN,
     best_threshold,
@@ -13,7 +14,6 @@ from tflane_jax.evaluation.found_lanes import (
     lane_scores,
 )
 from tflane_jax.evaluation.lane_graph import LaneGraphMetrics
-from tflane_jax.geometry.distances import discrete_frechet
 from tflane_jax.metrics.centerline_matching import relaxation
 from tflane_jax.metrics.frames import LaneDetections, LaneTruth
 from tflane_jax.metrics.openlane_v2 import CenterlineMetrics
@@ -32,7 +32,7 @@ def frame(seed, lanes=6, queries=30, points=5):
 @pytest.mark.parametrize("seed", range(5))
 def test_confidences_against_loops(seed):
     truth, detected, scores = frame(seed)
-    distance = np.array([[float(discrete_frechet(t, d)) for d in detected] for t in truth])
+    distance = all_pairs(frechet, truth, detected)
     distance *= relaxation(truth)[:, None]
     expected = np.full(len(truth), -np.inf)
     for p, score in enumerate(scores):

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from tflane_jax.evaluation.vector_maps import dividers, map_detections, map_lines, map_truth
+from tflane_jax.evaluation.vector_maps import dividers, map_detections, map_truth
 from tflane_jax.metrics import VectorMapMetrics
 from tflane_jax.scene import Areas, AreaType, LaneGraph, LineType
 
@@ -102,14 +102,6 @@ def test_padding_changes_no_metric():
     ]
     assert results[0] == results[1]
     assert results[0]["AP_boundary"] == 1.0
-
-
-def test_padded_lines_become_truth():
-    truth = map_lines(
-        np.stack([straight(1), np.full((5, 3), np.nan), straight(2)]), np.array([1, 99, 2]), np.array([1, 0, 1], bool)
-    )
-    np.testing.assert_array_equal(truth.classes, [1, 2])
-    np.testing.assert_array_equal(truth.points, np.stack([straight(1), straight(2)])[..., :2])
 
 
 def test_empty_input():

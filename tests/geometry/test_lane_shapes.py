@@ -7,17 +7,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tflane_jax.geometry.cameras import project
-from tflane_jax.geometry.lane_shapes import (
+from tests.geometry.ground_curves import (
     GroundCurve,
-    ImageCurve,
-    curve_columns,
     flat_image_curve,
     ground_offset,
     normalised_image_curve,
     pinhole_image_curve,
     tilted_image_curve,
 )
+from tflane_jax.geometry.cameras import project
+from tflane_jax.geometry.lane_shapes import curve_columns
 
 FOCAL, HEIGHT = 1000.0, 1.6
 AHEAD = np.linspace(8.0, 90.0, 30)
@@ -124,7 +123,3 @@ def test_the_horizon_is_a_pole_only_beyond_the_least_depth():
 @pytest.mark.parametrize("shape", [(0, 5), (3, 0), (1, 1)])
 def test_sizes(shape):
     assert curve_columns(np.zeros((shape[0], 6)), np.ones(shape)).shape == shape
-
-
-def test_pytrees():
-    assert jax.tree.leaves(ImageCurve(*range(6))) == list(range(6))

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from tests.golden import case_id, golden_modules, load_module_case, numbered
-from tflane_jax.geometry.line_orders import order_indices, point_orders, vertex_orders
+from tflane_jax.geometry.line_orders import order_indices, point_orders
+from tflane_jax.geometry.polylines import resample_lines
 
 PATTERNS = {
     "v0": {"closing": "rolled"},
@@ -16,6 +17,13 @@ PATTERNS = {
     "v3": {"ways": "both"},
 }
 CENTERLINE = 3
+
+
+def vertex_orders(vertices, points, ways):
+    """Return the orders of one line before resampling, each resampled to P points: v2 (v3: `ways="both"`)."""
+    if not np.array_equal(vertices[0], vertices[-1]):
+        return resample_lines([vertices, vertices[::-1]], points)
+    return resample_lines([vertices[order] for order in order_indices(len(vertices), ways)], points)
 
 
 @pytest.mark.golden

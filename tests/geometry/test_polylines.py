@@ -12,7 +12,15 @@ from shapely import LineString, Point, box
 
 from tests.shared import shared_root
 from tflane_jax.geometry import PerceptionRange, pose_matrix, transform_points
-from tflane_jax.geometry.polylines import arc_length, clip_to_range, nearest_lines, nearest_on, resample, sample_at
+from tflane_jax.geometry.polylines import (
+    arc_length,
+    clip_to_range,
+    nearest_lines,
+    nearest_on,
+    pad_lines,
+    resample,
+    sample_at,
+)
 
 QUICK = settings(max_examples=60)
 RANGE = PerceptionRange((-10.0, 10.0), (-5.0, 5.0))
@@ -167,3 +175,9 @@ def test_clipping_interpolates_height_and_splits():
     first, second = clip_to_range(line, RANGE)
     np.testing.assert_allclose(first, [[0, 0, 0], [10, 0, 5]])
     np.testing.assert_allclose(second, [[10, 2, 5], [0, 2, 0]])
+
+
+def test_pad_lines_without_lines_or_points():
+    assert pad_lines([]).shape[::2] == (0, 3)
+    with pytest.raises(ValueError, match="polyline 1 has no points"):
+        pad_lines([np.zeros((2, 3)), np.zeros((0, 3))])

@@ -7,11 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from tests.converted import converted_params
 from tests.golden import batch_leading, case_id, golden_modules, load_module_case, options
 from tests.golden_compare import compare
 from tests.layers.batch_bugs import EXAMPLES, like_the_reference
 from tflane_jax.convert.bevformer import SPATIAL_ATTENTION, TEMPORAL_ATTENTION
-from tflane_jax.convert.renaming import renamed_params
 from tflane_jax.layers.bev_attention import SpatialCrossAttention, TemporalSelfAttention, first_seen
 
 
@@ -29,7 +29,7 @@ def check_temporal(case):
     module = TemporalSelfAttention(sizes.dim, sizes.heads, sizes.points, 1 + baseline)
 
     def outputs(torch_params, inputs):
-        params = renamed_params(torch_params, TEMPORAL_ATTENTION)
+        params = converted_params(torch_params, TEMPORAL_ATTENTION)
 
         def one(query, position, history, reference):
             attended = module.apply({"params": params}, query + position, history, query, shape, reference)
@@ -68,7 +68,7 @@ def check_spatial(case, compact):
     module = SpatialCrossAttention(sizes.dim, sizes.heads, sizes.points, most if compact else None)
 
     def outputs(torch_params, inputs):
-        params = renamed_params(torch_params, SPATIAL_ATTENTION)
+        params = converted_params(torch_params, SPATIAL_ATTENTION)
 
         def one(query, features, reference, visible):
             return query + module.apply({"params": params}, query, features, shapes, reference, visible)

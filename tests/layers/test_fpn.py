@@ -4,10 +4,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from tests.converted import converted_params
 from tests.golden import case_id, golden_modules, implemented, load_module_case, numbered, options
 from tests.golden_compare import compare
 from tflane_jax.convert.bevformer import FEATURE_PYRAMID
-from tflane_jax.convert.renaming import renamed_params
 from tflane_jax.layers.fpn import FeaturePyramid, FeaturePyramidConfig, enlarge
 
 
@@ -30,7 +30,7 @@ def check(case):
     pyramid = FeaturePyramid(FeaturePyramidConfig(sizes.out_channels, sizes.num_outs))
 
     def outputs(torch_params, inputs):
-        params = renamed_params(torch_params, FEATURE_PYRAMID)
+        params = converted_params(torch_params, FEATURE_PYRAMID)
         features = [jnp.asarray(inputs[name]).transpose(0, 2, 3, 1) for name in names]
         levels = pyramid.apply({"params": params}, features)
         return {f"p{i}": level.transpose(0, 3, 1, 2) for i, level in enumerate(levels)}

@@ -7,11 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from tests.converted import converted_params
 from tests.golden import case_id, golden_modules, load_module_case, options
 from tests.golden_compare import compare
 from tests.layers.batch_bugs import EXAMPLES, like_the_reference
 from tflane_jax.convert.bevformer import SPATIAL_ATTENTION
-from tflane_jax.convert.renaming import renamed_params
 from tflane_jax.layers.geometry_kernel import GeometryKernelAttention, kernel_offsets
 
 
@@ -29,7 +29,7 @@ def test_it_matches_the_reference(path, compact):
     module = GeometryKernelAttention(sizes.dim, sizes.heads, tuple(sizes.kernel_size), most if compact else None)
 
     def outputs(torch_params, inputs):
-        params = renamed_params(torch_params, SPATIAL_ATTENTION)
+        params = converted_params(torch_params, SPATIAL_ATTENTION)
 
         def one(query, features, reference, visible):
             return query + module.apply({"params": params}, query, features, shapes, reference, visible)

@@ -5,9 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from tests.converted import converted_params
 from tests.golden import batch_leading, case_id, golden_modules, load_module_case, numbered, options
 from tests.golden_compare import compare
-from tflane_jax.convert.toponet import relationship_params, scene_graph_params
+from tflane_jax.convert.toponet import RELATIONSHIP, SCENE_GRAPH
 from tflane_jax.layers.graph import (
     ElementGraphConvolution,
     ElementNodes,
@@ -59,7 +60,7 @@ def test_scene_graph_matches_the_reference(path):
     names = [name for name in ("te_query", "te_cls_scores", "lcte_adj") if name in case.inputs]
 
     def outputs(torch_params, arrays):
-        params = scene_graph_params(torch_params)
+        params = converted_params(torch_params, SCENE_GRAPH)
 
         def one(x, adjacency, *nodes):
             return module.apply({"params": params}, x, adjacency, ElementNodes(*nodes) if nodes else None)
@@ -79,7 +80,7 @@ def test_relationship_head_matches_the_reference(path):
     module = RelationshipHead(len(case.params[last]))
 
     def outputs(torch_params, arrays):
-        params = relationship_params(torch_params)
+        params = converted_params(torch_params, RELATIONSHIP)
         logits = jax.vmap(lambda a, b: module.apply({"params": params}, a, b))(arrays["o1_feats"], arrays["o2_feats"])
         return {"rel_pred": logits[..., None], "loss_rel": reference_loss(logits, case.inputs)}
 

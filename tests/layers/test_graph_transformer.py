@@ -14,7 +14,7 @@ from jax.test_util import check_grads
 
 from tests.golden import case_id, golden_modules, implemented, load_module_case, options
 from tests.golden_compare import compare
-from tflane_jax.layers.graph_transformer import (
+from tests.layers.published_gtn import (
     GTN_2019,
     GTN_2022,
     FastGraphTransformer,
@@ -22,9 +22,9 @@ from tflane_jax.layers.graph_transformer import (
     convolve,
     meta_path_graphs,
     normalise,
-    propagate,
     select,
 )
+from tflane_jax.layers.graph_transformer import propagate
 
 VARIANTS = {"2019": GTN_2019, "2022": GTN_2022}
 

@@ -10,7 +10,8 @@ import pytest
 
 from tests.golden import case_id, golden_modules, implemented, load_module_case, options
 from tests.golden_compare import compare
-from tflane_jax.convert.lstr import backbone_variables
+from tflane_jax.convert.lstr import RESNET
+from tflane_jax.convert.renaming import convert
 from tflane_jax.layers.batch_norm import BATCH_AXIS
 from tflane_jax.layers.resnet import ResNet, ResNetConfig, StemConvolution, max_pool
 
@@ -39,7 +40,7 @@ def check(case):
     train = found.mode == "train"
 
     def outputs(torch_params, inputs):
-        variables = backbone_variables(torch_params)
+        variables = convert(torch_params, RESNET, "ResNet").variables
 
         def one(x):
             return model.apply(variables, x[None], train=train, mutable=["batch_stats"])
@@ -55,7 +56,7 @@ def check(case):
     beside = {"grad_scalar", *(f"bn_after/{name}" for name in after)}
     statistics = compare(case, outputs, ignore=beside, absolute={name: noise.get(name, 0.0) for name in features})
     assert bool(after) <= train
-    wanted = backbone_variables(after)["batch_stats"]
+    wanted = convert(after, RESNET, "ResNet").variables["batch_stats"]
     for place, value in jax.tree.leaves_with_path(statistics["batch_stats"]) if after else []:
         expected = wanted
         for key in place:

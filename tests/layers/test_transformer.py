@@ -5,9 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from tests.converted import converted_params
 from tests.golden import batch_leading, case_id, golden_modules, implemented, load_module_case, options
 from tests.golden_compare import compare
-from tflane_jax.convert.lstr import decoder_layer_params, encoder_layer_params
+from tflane_jax.convert.lstr import DECODER_LAYER, ENCODER_LAYER
 from tflane_jax.layers.transformer import DecoderLayer, EncoderLayer, TransformerConfig
 
 # The fixtures' names of PyTorch's masks.
@@ -57,7 +58,7 @@ def check_encoder_layer(case):
     pairs = allowed(case, SELF_MASK[kind], SELF_PADDING[kind], batch, length, length, config.heads)
 
     def outputs(torch_params, inputs):
-        variables = {"params": encoder_layer_params(torch_params)}
+        variables = {"params": converted_params(torch_params, ENCODER_LAYER)}
         one = lambda x, mask: EncoderLayer(config).apply(variables, x, jnp.zeros_like(x), mask)  # noqa: E731
         return {"output": batch_leading(case, jax.vmap(one)(batch_leading(case, inputs["src"]), pairs))}
 
@@ -73,7 +74,7 @@ def check_decoder_layer(case):
     across = allowed(case, MEMORY_MASK, MEMORY_PADDING, batch, queries, keys, config.heads)
 
     def outputs(torch_params, inputs):
-        variables = {"params": decoder_layer_params(torch_params)}
+        variables = {"params": converted_params(torch_params, DECODER_LAYER)}
 
         def one(x, memory, mask, memory_mask):
             positions = jnp.zeros_like(x), jnp.zeros_like(memory)

@@ -8,10 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from tests.converted import converted_params
 from tests.golden import case_id, golden_modules, load_module_case, numbered
 from tests.golden_compare import compare
 from tests.models.cases import SEGMENTS, make_bucket_example, make_segment_example
-from tflane_jax.convert.toponet import relationship_params
+from tflane_jax.convert.toponet import RELATIONSHIP
 from tflane_jax.datasets.segment_targets import SegmentTargets
 from tflane_jax.layers.graph import RelationshipHead
 from tflane_jax.losses.costs import dice_cost, focal_cost, mask_cost
@@ -78,7 +79,7 @@ def test_topology_loss_matches_the_reference(path):
     head = RelationshipHead(len(case.params[hidden[-1]]))
 
     def outputs(torch_params, inputs):
-        params = {"params": relationship_params(torch_params)}
+        params = {"params": converted_params(torch_params, RELATIONSHIP)}
         logits = jax.vmap(lambda a, b: head.apply(params, a, b))(inputs["o1_feats"][-1], inputs["o2_feats"][-1])
         loss = successor_loss(logits, found, truth, LaneSegNetLossConfig())
         return {"rel_pred": logits[..., None], "loss_rel": loss}

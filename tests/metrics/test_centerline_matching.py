@@ -6,7 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.metrics.cases import random_frame
-from tflane_jax.geometry.distances import discrete_frechet, pad_lines
+from tests.metrics.definitions import all_pairs, frechet
+from tflane_jax.geometry.polylines import pad_lines
 from tflane_jax.metrics.centerline_matching import iou_distance, nearest_lanes
 
 
@@ -15,8 +16,7 @@ from tflane_jax.metrics.centerline_matching import iou_distance, nearest_lanes
 def test_nearest_equals_the_full_matrix(seed, lanes, detections):
     found, truth = random_frame(seed, lanes, detections)
     relax = [max(0.5, 1 - 0.005 * min(np.hypot(np.hypot(*v[:2]), v[2]) for v in line)) for line in truth.points]
-    pairs = [[w * discrete_frechet(a, b) for b in found.points] for w, a in zip(relax, truth.points, strict=True)]
-    matrix = np.array(pairs).reshape(lanes, detections)
+    matrix = np.array(relax)[:, None] * all_pairs(frechet, truth.points, found.points)
     distance, nearest = nearest_lanes(pad_lines(truth.points), pad_lines(found.points))
     np.testing.assert_allclose(distance, matrix.min(0), rtol=1e-12)
     np.testing.assert_array_equal(nearest, matrix.argmin(0))

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.metrics.definitions import all_pairs, chamfer
 from tflane_jax.errors import UserError
-from tflane_jax.geometry.distances import chamfer
 from tflane_jax.geometry.polylines import resample
 from tflane_jax.metrics.chamfer import PaddedLines, near_pairs, pair_chamfer
 
@@ -24,7 +24,7 @@ def test_no_near_pair_is_lost(seed, dims, within):
     rng = np.random.default_rng(seed)
     first, second = random_lines(rng, 6, dims), random_lines(rng, 7, dims)
     second[0] = first[2] + 0.1
-    matrix = np.array([[chamfer(x, y) for y in second] for x in first])
+    matrix = all_pairs(chamfer, first, second)
     limits, among = within * rng.uniform(0.5, 1.0, 6), rng.random((6, 7)) < 0.7
     a, b = PaddedLines.of(first, "a", dims), PaddedLines.of(second, "b", dims)
     i, j = near_pairs(a, b, limits, among)

@@ -5,7 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tflane_jax.geometry.distances import discrete_frechet
+from tests.metrics.definitions import all_pairs, frechet
+from tflane_jax.geometry.polylines import pad_lines
 from tflane_jax.metrics.frechet import end_distance, pair_frechet
 
 
@@ -15,10 +16,19 @@ def test_equals_the_recursion(seed, n, m, dims):
     rng = np.random.default_rng(seed)
     # Few levels, so that cells tie.
     a, b = rng.integers(0, 6, (4, n, dims)) / 2, rng.integers(0, 6, (5, m, dims)) / 2
-    expected = discrete_frechet(a[:, None], b[None])
+    expected = all_pairs(frechet, a, b)
     i, j = np.nonzero(rng.random((4, 5)) < 0.8)
     np.testing.assert_allclose(pair_frechet(a, b, i, j), expected[i, j], rtol=1e-14)
     assert (end_distance(a, b) <= expected).all()
+
+
+@settings(max_examples=40)
+@given(seed=st.integers(0, 10**6), counts=st.lists(st.integers(1, 8), min_size=1, max_size=4))
+def test_padding_by_the_last_vertex_keeps_the_distance(seed, counts):
+    rng = np.random.default_rng(seed)
+    lines = [rng.uniform(-5, 5, (count, 3)) for count in counts]
+    padded, i, j = pad_lines(lines), *np.indices((len(lines), len(lines))).reshape(2, -1)
+    np.testing.assert_allclose(pair_frechet(padded, padded, i, j), all_pairs(frechet, lines, lines).ravel(), rtol=1e-14)
 
 
 def test_by_hand():

@@ -15,13 +15,10 @@ from tflane_jax.geometry.poses import yaw_pose
 from tflane_jax.models.bevformer import (
     BevFormer,
     BevFormerConfig,
-    BevFrame,
     BevMemory,
     check_capacity,
-    encode_sequence,
     see_pillars,
     seen_queries,
-    step,
 )
 from tflane_jax.scene import CameraViews
 
@@ -120,11 +117,15 @@ def test_streaming_equals_the_scan_bit_for_bit(variables, encode):
     def stacked(make):
         return jax.tree.map(lambda *leaves: np.stack(leaves), *[make(t) for t in range(4)])
 
-    frames = BevFrame(
-        stacked(levels), stacked(lambda t: ring()), np.stack([POSE] * 4), np.array([False, True, True, False])
-    )
-    scanned = np.asarray(jax.jit(lambda f: encode_sequence(MODEL, variables, f))(frames))
-    one, carry = jax.jit(lambda m, f: step(MODEL, variables, m, f)), BevMemory.empty(CONFIG)
+    def step(memory, frame):
+        features, views, pose, has_previous = frame
+        bev = MODEL.apply(variables, features, views, memory.replace(valid=memory.valid & has_previous), pose)
+        return BevMemory(bev, jnp.ones((), bool)), bev
+
+    frames = stacked(levels), stacked(lambda t: ring()), np.stack([POSE] * 4), np.array([False, True, True, False])
+    start = BevMemory.empty(CONFIG)
+    scanned = np.asarray(jax.jit(lambda frames: jax.lax.scan(step, start, frames)[1])(frames))
+    one, carry = jax.jit(step), start
     for t in range(4):
         carry, bev = one(carry, jax.tree.map(lambda leaf, t=t: leaf[t], frames))
         np.testing.assert_array_equal(bev, scanned[t])

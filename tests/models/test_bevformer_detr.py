@@ -7,6 +7,7 @@ import jax
 import numpy as np
 import pytest
 
+from tests.converted import converted_params
 from tests.golden import case_id, golden_modules, load_module_case
 from tests.models.cases import BASELINE, make_example
 from tests.models.golden_lanes import (
@@ -21,7 +22,7 @@ from tests.models.golden_lanes import (
     truth,
 )
 from tests.parameters import random_params
-from tflane_jax.convert.toponet import baseline_lane_params
+from tflane_jax.convert.toponet import BASELINE_LANES
 from tflane_jax.errors import UserError
 from tflane_jax.losses.bevformer_detr import BevFormerDetrLossConfig
 from tflane_jax.losses.toponet import TopoNetLossConfig, lane_losses, matching_cost
@@ -49,7 +50,7 @@ def check_head(case):
     heads = random_params(partial(module.init, method=BevFormerDetr.decode), bev)["params"]
 
     def outputs(torch_params, inputs):
-        params = baseline_lane_params(torch_params)
+        params = converted_params(torch_params, BASELINE_LANES)
         last = f"heads_{decoder.layers - 1}"
         params[last] = params[last] | {"successor": heads[last]["successor"]}
 

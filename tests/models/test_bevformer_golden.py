@@ -5,12 +5,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from tests.converted import converted_params
 from tests.golden import case_id, golden_modules, load_module_case
 from tests.golden_compare import assert_outputs_close, compare
 from tests.layers.batch_bugs import EXAMPLES, like_the_reference
 from tests.models.golden_bev import aligned, bev_config, golden_views, is_baseline, level_names, without_unused
-from tflane_jax.convert.bevformer import ENCODER, convert_bevformer
-from tflane_jax.convert.renaming import check_fits, renamed_params
+from tflane_jax.convert.bevformer import BEV_CONSTRUCTER, ENCODER
+from tflane_jax.convert.renaming import check_fits, convert
 from tflane_jax.errors import UserError
 from tflane_jax.models.bev_encoder import BevEncoder
 from tflane_jax.models.bevformer import BevFormer, BevMemory, see_pillars
@@ -29,7 +30,7 @@ def check_encoder(case):
     reference, visible = jax.vmap(lambda one: see_pillars(config, one))(views)
 
     def outputs(torch_params, arrays):
-        params, has_past = renamed_params(torch_params, ENCODER), "prev_bev" in arrays
+        params, has_past = converted_params(torch_params, ENCODER), "prev_bev" in arrays
 
         def one(queries, position, tokens, past, shift, reference, visible):
             history = BevMemory(past, jnp.asarray(has_past))
@@ -59,7 +60,7 @@ def check_constructer(case):
     check_alignment(case, history, shift)
 
     def outputs(torch_params, arrays):
-        params = without_unused(case, convert_bevformer(torch_params).variables["params"])
+        params = without_unused(case, converted_params(torch_params, BEV_CONSTRUCTER))
 
         def one(features, views, history, shift, motion):
             arguments = (features, views, history, shift, motion)
@@ -85,7 +86,7 @@ def check_alignment(case, history, shift):
 def test_every_tensor_of_the_reference_is_accounted_for(path):
     case = load_module_case(path)
     config = bev_config(case)
-    converted = convert_bevformer(case.params)
+    converted = convert(case.params, BEV_CONSTRUCTER, "BEVFormer")
     assert [row["tensor"] for row in converted.table] == list(case.params)
     views = jax.tree.map(lambda leaf: leaf[0], golden_views(case.inputs))
     levels = [case.inputs[name][0].transpose(0, 2, 3, 1) for name in level_names(case)]
@@ -93,4 +94,4 @@ def test_every_tensor_of_the_reference_is_accounted_for(path):
     check_fits(converted.variables["params"], fresh["params"], path)
     layer = f"encoder.layers.{config.layers - 1}.norms.3.weight"
     with pytest.raises(UserError, match="no tensor of BEVFormer"):
-        convert_bevformer(case.params | {layer: case.params["level_embeds"]})
+        convert(case.params | {layer: case.params["level_embeds"]}, BEV_CONSTRUCTER, "BEVFormer")

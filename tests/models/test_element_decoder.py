@@ -5,11 +5,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from tests.converted import converted_params
 from tests.golden import case_id, golden_modules, load_module_case, numbered, options
 from tests.golden_compare import compare
 from tests.models.golden_lanes import by_layer
 from tests.parameters import random_params
-from tflane_jax.convert.toponet import element_decoder_params
+from tflane_jax.convert.toponet import ELEMENTS
 from tflane_jax.losses.toponet import TopoNetLossConfig
 from tflane_jax.losses.traffic_elements import element_cost, element_losses
 from tflane_jax.matching import match
@@ -58,7 +59,7 @@ def check(case):
     levels = numbered(case.inputs, r"feat(\d+)")
 
     def outputs(torch_params, inputs):
-        params = element_decoder_params(torch_params)
+        params = converted_params(torch_params, ELEMENTS)
 
         def one(size, *levels):
             levels = [level.transpose(1, 2, 0) for level in levels]

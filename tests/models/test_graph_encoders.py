@@ -8,12 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from tests.layers.published_gtn import GTN_2022, meta_path_graphs
 from tests.layers.test_image_graph import dense_stack
 from tests.parameters import random_params
 from tests.slow import with_slow
 from tflane_jax.errors import UserError
 from tflane_jax.layers.attention import MultiHeadAttention
-from tflane_jax.layers.graph_transformer import GTN_2022, meta_path_graphs
 from tflane_jax.layers.image_graph import SIDES
 from tflane_jax.layers.masks import key_mask
 from tflane_jax.models.graph_encoders import (

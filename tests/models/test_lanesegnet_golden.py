@@ -4,11 +4,12 @@ import jax
 import numpy as np
 import pytest
 
+from tests.converted import converted_params
 from tests.golden import case_id, golden_modules, implemented, load_module_case
 from tests.golden_compare import compare
 from tests.models.golden_lanes import bev_maps, by_layer, encoder_config, queries_of
 from tests.models.golden_segments import decoder_config, segments_by_name, targets
-from tflane_jax.convert.lanesegnet import segment_head_params
+from tflane_jax.convert.lanesegnet import LANESEGNET_HEAD
 from tflane_jax.layers.graph import RelationshipHead
 from tflane_jax.losses.lanesegnet import LaneSegNetLossConfig, assign_segments, matching_cost, segment_losses
 from tflane_jax.models.lanesegnet import LaneSegNet, LaneSegNetConfig
@@ -42,7 +43,7 @@ def check_head(case):
     )
 
     def outputs(torch_params, inputs):
-        params = segment_head_params(torch_params) | {"successor": relations}
+        params = converted_params(torch_params, LANESEGNET_HEAD) | {"successor": relations}
 
         def one(bev):
             prediction, state = module.apply(

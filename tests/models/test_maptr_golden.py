@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from tests.converted import converted_params
 from tests.golden import case_id, golden_modules, load_module_case
 from tests.golden_compare import compare
 from tests.layers.batch_bugs import EXAMPLES, like_the_reference
@@ -17,7 +18,7 @@ from tests.models.golden_maps import (
     perception_range,
     targets,
 )
-from tflane_jax.convert.maptr import map_head_params
+from tflane_jax.convert.maptr import MAPTR_HEAD
 from tflane_jax.evaluation.vector_maps import detections_of_lines
 from tflane_jax.losses.maptr import MapTrLossConfig, assign_lines, line_losses, matching_cost
 from tflane_jax.models.bevformer import BevFormer
@@ -36,7 +37,7 @@ def check_head(case):
     truth, (views, history, shift) = targets(case), encoder_inputs(case)
 
     def outputs(torch_params, inputs):
-        params = map_head_params(torch_params)
+        params = converted_params(torch_params, MAPTR_HEAD)
         bev_params = params.pop("encoder")["bev"]
 
         def one(features, views, history, shift, motion):

@@ -5,11 +5,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from tests.converted import converted_params
 from tests.golden import case_id, golden_modules, implemented, load_module_case, numbered, options
 from tests.golden_compare import compare
 from tests.models.golden_lanes import by_layer
 from tests.models.golden_maps import decoder_config, lines_by_name, perception_range, targets
-from tflane_jax.convert.maptr import map_v2_head_params
+from tflane_jax.convert.maptr import MAPTRV2_HEAD
 from tflane_jax.losses.maptr import assign_lines, line_losses, matching_cost
 from tflane_jax.losses.maptrv2 import MapTrV2LossConfig, mask_loss, one_to_many_losses
 from tflane_jax.models.auxiliary import AUXILIARY, LineMaskHead, auxiliary_outputs
@@ -32,7 +33,7 @@ def check_head(case):
     module, truth = MapTrV2(config), targets(case)
 
     def outputs(torch_params, inputs):
-        params = map_v2_head_params(torch_params)
+        params = converted_params(torch_params, MAPTRV2_HEAD)
         view_head = {"params": params.pop("encoder")["view_mask_head"]}
 
         def one(bev):

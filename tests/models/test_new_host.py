@@ -12,8 +12,9 @@ from tests.evaluation.test_lane_graph import labelled
 from tests.models.cases import BASELINE
 from tests.models.toy_host import ToyHostConfig, ToyHostLossConfig
 from tests.parameters import random_params
-from tflane_jax.config import RunConfig, WorldData, apply_overrides
+from tflane_jax.config import RunConfig, WorldData
 from tflane_jax.config_io import from_json, to_json, to_text
+from tflane_jax.config_overrides import apply_overrides
 from tflane_jax.datasets.base import ExampleConfig
 from tflane_jax.datasets.map_lines import MapLinesConfig
 from tflane_jax.evaluation.results import EvaluationConfig

@@ -6,15 +6,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from tests.converted import converted_params
 from tests.golden import case_id, golden_modules, implemented, load_module_case, numbered, options
 from tests.golden_compare import compare
 from tests.layers.batch_bugs import EXAMPLES, like_the_reference
 from tests.models.golden_bev import aligned, bev_config, golden_views, level_names, without_unused
 from tests.models.test_bevformer_golden import check_alignment
 from tests.models.test_sd_map_encoder import fused_with
-from tflane_jax.convert.renaming import check_fits, renamed_params
-from tflane_jax.convert.sd_map import CROSS_ATTENTION, convert_sd_map_encoder, convert_smerf_bevformer
-from tflane_jax.errors import UserError
+from tflane_jax.convert.renaming import check_fits, convert
+from tflane_jax.convert.sd_map import CROSS_ATTENTION, SD_MAP_ENCODER, SMERF_CONSTRUCTER
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.layers.polyline_encoder import PolylineEncoderConfig, temperature_encoding
 from tflane_jax.models.bevformer import BevFormer, see_pillars
@@ -85,7 +85,7 @@ def check_map_encoder(case, path):
     encoder, capacity = SdMapEncoder(config, limits), 2 + max(len(case.inputs[name]) for name in names)
 
     def outputs(torch_params, inputs):
-        variables, out = {"params": convert_sd_map_encoder(torch_params).variables["params"]}, {}
+        variables, out = {"params": converted_params(torch_params, SD_MAP_ENCODER)}, {}
         for name in names:
             i, lines = name.removeprefix("poly"), inputs[name]
             one_hot = case.inputs.get(f"onehot.{i}", np.zeros((len(lines), 0)))
@@ -102,13 +102,11 @@ def check_map_encoder(case, path):
 
     compare(case, outputs)
 
-    converted = convert_sd_map_encoder(case.params)
+    converted = convert(case.params, SD_MAP_ENCODER, "SMERF's map encoder")
     assert [row["tensor"] for row in converted.table] == list(case.params)
     points = case.inputs[names[0]].shape[1]
     fresh = jax.eval_shape(encoder.init, jax.random.key(0), jax.tree.map(jnp.asarray, SdMap.empty(1, points)))
     check_fits(converted.variables["params"], fresh["params"], path)
-    with pytest.raises(UserError, match="no tensor of SMERF's map encoder"):
-        convert_sd_map_encoder({"map_embeding.weight": case.params["map_embedding.weight"]})
 
 
 @pytest.mark.parametrize("path", golden_modules("smerf_masked_cross_attention*"), ids=case_id)
@@ -124,7 +122,7 @@ def check_cross_attention(case):
     def outputs(torch_params, inputs):
         channels = inputs["query"].shape[-1]
         norm = {"scale": jnp.ones(channels), "bias": jnp.zeros(channels)}
-        variables = {"params": renamed_params(torch_params, CROSS_ATTENTION) | {"norm": norm}}
+        variables = {"params": converted_params(torch_params, CROSS_ATTENTION) | {"norm": norm}}
 
         def one(query, position, value, count):
             valid = jnp.arange(len(value)) < count
@@ -160,7 +158,7 @@ def check_constructer(case):
     check_alignment(case, history, shift)
 
     def outputs(torch_params, inputs):
-        params = without_unused(case, convert_smerf_bevformer(torch_params).variables["params"])
+        params = without_unused(case, converted_params(torch_params, SMERF_CONSTRUCTER))
 
         def one(features, views, history, shift, motion, maps, valid):
             arguments, fuse = (features, views, history, shift, motion), fused_with(module, maps, valid)
@@ -174,7 +172,7 @@ def check_constructer(case):
             return {"output": jax.vmap(one, axis_name=EXAMPLES)(*every)}
 
     compare(case, outputs, ignore=[name for name in case.outputs if name.startswith("inner.")])
-    converted = convert_smerf_bevformer(case.params)
+    converted = convert(case.params, SMERF_CONSTRUCTER, "SMERF's BEVFormer")
     assert [row["tensor"] for row in converted.table] == list(case.params)
 
 

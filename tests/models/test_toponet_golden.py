@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from tests.converted import converted_params
 from tests.golden import case_id, golden_modules, load_module_case
 from tests.golden_compare import assert_outputs_close
 from tests.models.golden_lanes import (
@@ -18,7 +19,7 @@ from tests.models.golden_lanes import (
     queries_of,
     truth,
 )
-from tflane_jax.convert.toponet import toponet_lane_params
+from tflane_jax.convert.toponet import TOPONET_LANES
 from tflane_jax.losses.toponet import TopoNetLossConfig, element_lane_loss, lane_losses, matching_cost
 from tflane_jax.matching import Assignment, match
 from tflane_jax.models.element_decoder import ElementOutput
@@ -55,7 +56,7 @@ def check_head(case):
     elements, found = element_truth(case, lanes.valid.shape[1])
 
     def outputs(torch_params, inputs):
-        params = toponet_lane_params(torch_params)
+        params = converted_params(torch_params, TOPONET_LANES)
 
         def one(bev, queries, logits):
             # Boxes play no part here.

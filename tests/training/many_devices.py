@@ -31,7 +31,7 @@ from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.training.schedule import OptimConfig, make_optimizer
 from tflane_jax.training.sharding import placed
 from tflane_jax.training.state import init_states
-from tflane_jax.training.step import compiled_update
+from tflane_jax.training.step import UpdateForm, compiled_update
 
 BATCH = 8
 EVENLY = dataclasses.replace(CONFIG, batch_size=BATCH, seeds=(0, 1))
@@ -99,7 +99,7 @@ def in_parts(accumulate: int = 2) -> list:
     mesh = training_mesh(2 * BATCH, accumulate)
     [state] = init_states(Quiet(), make_optimizer(optim, 9), [0], {"x": arrays["x"][0]})
     state, batch = replicated(state, mesh), divided(arrays, mesh)
-    update: Any = compiled_update(Quiet(), optim, 9, state, batch, mesh=mesh, accumulate=accumulate)
+    update: Any = compiled_update(Quiet(), optim, 9, state, batch, UpdateForm(mesh=mesh, accumulate=accumulate))
     moved = sum(update.as_text().count(name) for name in (" all-gather(", " all-to-all(", " collective-permute("))
     return [np.asarray(update(state, batch)[0].params["line"]["kernel"]).tolist(), moved]
 
@@ -144,8 +144,8 @@ def updated(optim: OptimConfig, *, shard: bool) -> Any:
     arrays, mesh = line_arrays(BATCH), training_mesh(BATCH)
     [state] = init_states(TASK, make_optimizer(optim, CONFIG.steps), [0], {"x": arrays["x"][0]})
     state, batch = placed(state, mesh, shard=shard), divided(arrays, mesh)
-    form: dict[str, Any] = {"donate": False, "mesh": mesh, "shard_state": shard}
-    return compiled_update(TASK, optim, CONFIG.steps, state, batch, **form)(state, batch)[0]
+    form = UpdateForm(donate=False, mesh=mesh, shard_state=shard)
+    return compiled_update(TASK, optim, CONFIG.steps, state, batch, form)(state, batch)[0]
 
 
 def held() -> dict[str, list]:

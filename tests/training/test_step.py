@@ -13,7 +13,7 @@ from tflane_jax.models.parameters import split_statistics
 from tflane_jax.training.rng import stream
 from tflane_jax.training.schedule import OptimConfig, make_optimizer, make_schedule
 from tflane_jax.training.state import init_states
-from tflane_jax.training.step import compiled_update, make_update_step, moving_average, update_all
+from tflane_jax.training.step import UpdateForm, compiled_update, make_update_step, moving_average, update_all
 
 OPTIM = OptimConfig(lr=0.01, warmup_steps=2)
 STEPS = 20
@@ -82,7 +82,7 @@ def test_learning_rate_is_that_of_the_update():
 
 
 def test_one_trace_and_an_error_for_a_second():
-    states, update = fresh((0, 1)), make_update_step(LineTask(), OPTIM, STEPS, donate=False)
+    states, update = fresh((0, 1)), make_update_step(LineTask(), OPTIM, STEPS, UpdateForm(donate=False))
     for step in range(3):
         states, _ = update_all(update, states, [batch_of(0, step), batch_of(1, step)])
     with pytest.raises(AssertionError, match="traced"):
@@ -113,7 +113,7 @@ def test_non_finite_numbers_leave_the_state_as_it_was(poison):
 
 def test_one_non_finite_seed_stops_the_update_of_all_seeds():
     states = fresh((0, 1))
-    update = make_update_step(LineTask(blow_up=100.0), OPTIM, STEPS, donate=False)
+    update = make_update_step(LineTask(blow_up=100.0), OPTIM, STEPS, UpdateForm(donate=False))
     batches = [batch_of(0, 0), batch_of(1, 0)]
     batches[1]["x"][0, 0] = 1000.0
     after, metrics = update_all(update, states, batches)
@@ -125,7 +125,7 @@ def test_one_non_finite_seed_stops_the_update_of_all_seeds():
 
 def test_several_seeds_each_equal_a_single_seed():
     seeds = (3, 8)
-    states, update = fresh(seeds), make_update_step(LineTask(), OPTIM, STEPS, donate=False)
+    states, update = fresh(seeds), make_update_step(LineTask(), OPTIM, STEPS, UpdateForm(donate=False))
     singles, single = [alone(seed) for seed in seeds], make_update_step(LineTask(), OPTIM, STEPS)
     for step in range(4):
         batches = [batch_of(seed, step) for seed in seeds]
@@ -155,7 +155,7 @@ def test_parts_of_a_batch_give_the_step_of_the_whole_where_the_loss_is_a_mean_ov
     batch, results = batch_of(0, 0, size=6), []
     for parts in (1, 3):
         [state] = init_states(Quiet(), make_optimizer(OPTIM, STEPS), [0], example)
-        results.append(make_update_step(Quiet(), OPTIM, STEPS, accumulate=parts)(state, batch))
+        results.append(make_update_step(Quiet(), OPTIM, STEPS, UpdateForm(accumulate=parts))(state, batch))
     (whole, metrics), (parts, of_parts) = results
     assert metrics.keys() == of_parts.keys()
     for name, value in metrics.items():

@@ -32,9 +32,9 @@ from tflane_jax.ablations.carry_over_plan import (
     recorded_logs,
     with_trainings,
 )
-from tflane_jax.ablations.compare import draw_models, summary_of
 from tflane_jax.ablations.comparison import Scores, Variant, compact
 from tflane_jax.ablations.declaration import Claim, Declaration, Declared, check, declare, model_of_row
+from tflane_jax.ablations.finished_runs import draw_models, summary_of
 from tflane_jax.ablations.jobs import Failure, Job, check_rows
 from tflane_jax.ablations.scores import measure
 from tflane_jax.ablations.statistics import holm, paired_difference

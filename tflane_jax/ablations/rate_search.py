@@ -15,7 +15,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from tflane_jax.ablations.compare import summary_of
+from tflane_jax.ablations.finished_runs import summary_of
 from tflane_jax.ablations.jobs import Job, check_rows
 from tflane_jax.ablations.paper.table import PaperTable, RateSearch
 from tflane_jax.ablations.store import stored_jobs

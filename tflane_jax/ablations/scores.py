@@ -19,8 +19,9 @@ from typing import Any
 import tflane_jax
 from tflane_jax.ablations.jobs import Job
 from tflane_jax.ablations.recorded import Measured, Which, evaluation_name
-from tflane_jax.config import RunConfig, apply_overrides
+from tflane_jax.config import RunConfig
 from tflane_jax.config_io import to_json
+from tflane_jax.config_overrides import apply_overrides
 from tflane_jax.errors import UserError
 from tflane_jax.evaluation.results import SceneRatio, SceneSamples
 from tflane_jax.files.atomic import write_json

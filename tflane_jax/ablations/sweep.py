@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Literal
 
 from tflane_jax.ablations.comparison import Variant, compact
-from tflane_jax.config import RunConfig, apply_overrides
+from tflane_jax.config import RunConfig
+from tflane_jax.config_overrides import apply_overrides
 from tflane_jax.errors import UserError
 from tflane_jax.plots.tables import format_table, save_table
 from tflane_jax.progress import progress_bar

@@ -21,21 +21,19 @@ from pathlib import Path
 from typing import Any
 
 from tflane_jax.ablations.archive import Archive, write_archive
-from tflane_jax.ablations.compare import (
-    draw_models,
-    evaluate_runs,
-    first_models,
-    reasons,
-    save_plan,
-    summary_of,
-    without_failures,
-)
 from tflane_jax.ablations.comparison import Variant, compact
 from tflane_jax.ablations.declaration import FILE as DECLARATION
 from tflane_jax.ablations.declaration import Declared, declare
 from tflane_jax.ablations.effects import Tested, judged_claims
 from tflane_jax.ablations.facts import facts, row_minutes
 from tflane_jax.ablations.findings import findings, save_effects
+from tflane_jax.ablations.finished_runs import (
+    draw_models,
+    first_models,
+    save_plan,
+    summary_of,
+    train_and_evaluate,
+)
 from tflane_jax.ablations.jobs import Job, ScoredBy
 from tflane_jax.ablations.paper.table import PaperTable
 from tflane_jax.ablations.results import Results
@@ -43,7 +41,6 @@ from tflane_jax.ablations.reuse import FILE, archive_of, unused
 from tflane_jax.ablations.scores import CHECKPOINTS, OWN_TEST, code_digest, evaluations, measure
 from tflane_jax.ablations.store import TOPOLOGY
 from tflane_jax.ablations.table_plan import plan_table, seed_by_seed, store_of, tell_work
-from tflane_jax.ablations.workers import train_all
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import write_json, write_text
 from tflane_jax.files.fields import load_json
@@ -107,11 +104,8 @@ def run_table(
         declared = declare(table.declaration, plan, planned.declared(), every, folder)
     tell_work(planned, seeds, store_of(out, quick=quick), jobs, quick=quick)
 
-    failures = train_all(seed_by_seed(planned.named()), jobs, cores)
-    results, trained = Results(tuple(configs), tuple(seeds), {}), without_failures(plan, failures)
-    failures += evaluate_runs(trained, results)
-    results.failed.update(reasons(plan, failures))
-    trained = without_failures(plan, failures)
+    results = Results(tuple(configs), tuple(seeds), {})
+    trained, failures = train_and_evaluate(plan, seed_by_seed(planned.named()), results, jobs, cores)
     _add_geometric(trained, results)
     save_plan(plan, failures, results, folder)
     if not results.scores:

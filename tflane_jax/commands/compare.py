@@ -8,8 +8,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from tflane_jax.ablations.declaration import Claim, Declaration
-from tflane_jax.config import apply_overrides, load_config
+from tflane_jax.config import load_config
 from tflane_jax.config_files import split_reference
+from tflane_jax.config_overrides import apply_overrides
 from tflane_jax.errors import UserError
 from tflane_jax.training.runtime import configure_jax
 

@@ -11,7 +11,8 @@ import numpy as np
 
 from tflane_jax.commands.sources import chosen_source, data_name
 from tflane_jax.commands.views import with_images
-from tflane_jax.config import FrontViewData, RunConfig, apply_overrides, load_config
+from tflane_jax.config import FrontViewData, RunConfig, load_config
+from tflane_jax.config_overrides import apply_overrides
 from tflane_jax.datasets import sources
 from tflane_jax.datasets.base import SPLITS
 from tflane_jax.datasets.batches import prepared

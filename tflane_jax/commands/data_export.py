@@ -12,7 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from tflane_jax.commands.sources import chosen_source
-from tflane_jax.config import apply_overrides, load_config
+from tflane_jax.config import load_config
+from tflane_jax.config_overrides import apply_overrides
 from tflane_jax.datasets import sources
 from tflane_jax.datasets.argoverse2_export import export_tracks
 from tflane_jax.datasets.base import DrivenDataset, Split

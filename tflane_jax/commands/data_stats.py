@@ -10,7 +10,8 @@ import numpy as np
 
 from tflane_jax.commands.data_beside import beside
 from tflane_jax.commands.sources import chosen_source, data_name
-from tflane_jax.config import RunConfig, apply_overrides, load_config
+from tflane_jax.config import RunConfig, load_config
+from tflane_jax.config_overrides import apply_overrides
 from tflane_jax.datasets import sources
 from tflane_jax.errors import UserError
 from tflane_jax.evaluation.example_statistics import example_stats

@@ -12,9 +12,10 @@ from pathlib import Path
 import jax
 
 from tflane_jax import processes
-from tflane_jax.config import RunConfig, apply_overrides, load_config
+from tflane_jax.config import RunConfig, load_config
 from tflane_jax.config_files import split_reference
 from tflane_jax.config_io import from_json, to_json, to_text
+from tflane_jax.config_overrides import apply_overrides
 from tflane_jax.errors import UserError
 from tflane_jax.runs import resumable_config, train_run
 from tflane_jax.startup import write

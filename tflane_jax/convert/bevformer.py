@@ -5,11 +5,8 @@ The backbone has torchvision's names, the pyramid MMDetection's, and the encoder
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 from tflane_jax.convert.lstr import RESNET
-from tflane_jax.convert.renaming import Converted, Rule, below, convert
-from tflane_jax.geometry.namespace import AnyArray
+from tflane_jax.convert.renaming import Rule, below
 
 FEATURE_PYRAMID: tuple[Rule, ...] = (
     (r"lateral_convs\.(\d+)\.conv\.weight", r"lateral_\1/kernel", "conv"),
@@ -48,12 +45,3 @@ BEV_CONSTRUCTER: tuple[Rule, ...] = (
     (r"can_bus_mlp\.2\.(weight|bias)", r"motion/out/\1", "linear"),
     (r"can_bus_mlp\.norm\.(weight|bias)", r"motion/norm/\1", "norm"),
 )
-
-
-def convert_bevformer(state: Mapping[str, AnyArray]) -> Converted:
-    """Return the variables of `models.bevformer.BevFormer` from a BEV constructer's, and an account of every tensor.
-
-    Raises:
-        UserError: a tensor that the constructer does not have.
-    """
-    return convert(state, BEV_CONSTRUCTER, "BEVFormer")

@@ -3,7 +3,8 @@
 All of them call the image encoder `img_backbone` and `img_neck`, the BEV encoder `bev_constructor`, the head of traffic
 elements `bbox_head`, that of lanes `pts_bbox_head`, and topology heads beside it `lclc_head` and `lcte_head`; in
 LaneSegNet's map-element-bucket variant these are `lsls_head` and `lste_head`, and areas have the `area_head`. MapTR's
-BEV encoder is part of its head.
+BEV encoder is part of its head. SMERF adds a `map_encoder` to TopoNet and the baseline, and attention to the map in
+`bev_constructor`.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from tflane_jax.convert.fitting import Expected, Missing, expected_variables, fi
 from tflane_jax.convert.lanesegnet import LANESEGNET_HEAD
 from tflane_jax.convert.maptr import MAPTR_HEAD, MAPTRV2_HEAD, area_head
 from tflane_jax.convert.renaming import Converted, Rule, below, convert, naming
+from tflane_jax.convert.sd_map import SD_MAP_ENCODER, SMERF_CONSTRUCTER
 from tflane_jax.convert.toponet import BASELINE_LANES, ELEMENTS, RELATIONSHIP, TOPONET_LANES
 from tflane_jax.convert.torch_file import read_state_dict
 from tflane_jax.errors import UserError
@@ -72,20 +74,23 @@ def convert_host(state: Mapping[str, AnyArray], model: PublishedHost) -> Convert
 
     Args:
         state: tensors of the reference's detector, with or without the prefix `module.`.
-        model: decides how many layers there are, and whether the backbone's norms are constants.
+        model: decides how many layers there are, whether the backbone's norms are constants, and whether there is a map
+            encoder.
 
     Raises:
         UserError: a tensor that the detector does not have.
     """
     network, heads = _head_rules(model)
+    sd_map = model.priors.sd_map is not None
     rules = (
         *below("", "encoder/images", IMAGE_ENCODER),
-        *below(r"bev_constructor\.", "encoder/bev", BEV_CONSTRUCTER),
+        *below(r"bev_constructor\.", "encoder/bev", SMERF_CONSTRUCTER if sd_map else BEV_CONSTRUCTER),
+        *(below(r"map_encoder\.", "sd_map_tokens", SD_MAP_ENCODER) if sd_map else ()),
         *heads,
     )
     frozen = isinstance(model.encoder, CameraEncoderConfig) and model.encoder.images.backbone.frozen_norms
     norms = r"encoder/images/backbone/(.*/)?\w*bn\d?/.*" if frozen else "(?!)"
-    return convert(state, rules, network, frozen=norms)
+    return convert(state, rules, f"{network} with SMERF" if sd_map else network, frozen=norms)
 
 
 def load_host(path: Path, model: PublishedHost, missing: Missing = "left out") -> tuple[Params, list[dict[str, str]]]:

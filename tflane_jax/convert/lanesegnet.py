@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
-from tflane_jax.convert.renaming import Rule, convert
+from tflane_jax.convert.renaming import Rule
 from tflane_jax.convert.toponet import PLAIN_DECODER
-from tflane_jax.geometry.namespace import AnyArray
 
 
 def branch(name: str, ours: str, *, norm: bool = False, layers: int = 3) -> tuple[Rule, ...]:
@@ -33,8 +29,3 @@ LANESEGNET_HEAD: tuple[Rule, ...] = (
     *branch("reg_branches_offset", "offset"),
     *branch("mask_embed", "mask"),
 )
-
-
-def segment_head_params(state: Mapping[str, AnyArray]) -> dict[str, Any]:
-    """Return the parameters of `LaneSegNet.decode`, less those of the topology, from those of LaneSegHead."""
-    return convert(state, LANESEGNET_HEAD, "LaneSegNet's lane head").variables["params"]

@@ -9,14 +9,13 @@ from __future__ import annotations
 import functools
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 from tflane_jax.convert.fitting import Expected, Missing, expected_variables, fitted
 from tflane_jax.convert.lstr_graphs import GRAPH_LAYER, UNMAPPED, as_graph_state, check_encoder, selections
-from tflane_jax.convert.renaming import Converted, Rule, below, convert, naming, put, renamed_params, size_text
+from tflane_jax.convert.renaming import Converted, Rule, below, convert, naming, put, size_text
 from tflane_jax.convert.torch_file import read_state_dict
 from tflane_jax.convert.weights_files import check_digest, find_weights
 from tflane_jax.errors import UserError
@@ -44,14 +43,14 @@ _FEED_FORWARD = (
     (r"linear2\.(weight|bias)", r"feed_forward/contract/\1", "linear"),
     (r"norm1\.(weight|bias)", r"attended/norm/\1", "norm"),
 )
-_ENCODER_LAYER = (*_ATTENTION, *_FEED_FORWARD, (r"norm2\.(weight|bias)", r"fed/norm/\1", "norm"))
+ENCODER_LAYER = (*_ATTENTION, *_FEED_FORWARD, (r"norm2\.(weight|bias)", r"fed/norm/\1", "norm"))
 _FED: tuple[Rule, ...] = (
     (r"linear1\.(weight|bias)", r"expand/\1", "linear"),
     (r"linear2\.(weight|bias)", r"contract/\1", "linear"),
     (r"norm1\.(weight|bias)", r"graph_norm/\1", "norm"),
     (r"norm2\.(weight|bias)", r"fed_norm/\1", "norm"),
 )
-_DECODER_LAYER = (
+DECODER_LAYER = (
     *_ATTENTION,
     *_FEED_FORWARD,
     (r"norm2\.(weight|bias)", r"crossed/norm/\1", "norm"),
@@ -63,7 +62,7 @@ _AROUND_THE_ENCODER: tuple[Rule, ...] = (
     (r"input_proj\.weight", "input_projection/kernel", "pointwise"),
     (r"input_proj\.bias", "input_projection/bias", "vector"),
     (r"query_embed\.weight", "queries", "vector"),
-    *below(r"transformer\.decoder\.layers\.(\d+)\.", r"decoder_\1", _DECODER_LAYER),
+    *below(r"transformer\.decoder\.layers\.(\d+)\.", r"decoder_\1", DECODER_LAYER),
     (r"transformer\.decoder\.norm\.(weight|bias)", r"decoder_norm/\1", "norm"),
     (r"class_embed\.(weight|bias)", r"heads/class/\1", "linear"),
     (r"specific_embed\.layers\.(\d+)\.(weight|bias)", r"heads/specific/linear_\1/\2", "linear"),
@@ -86,7 +85,7 @@ def convert_lstr(
         UserError: a tensor that LSTR does not have.
     """
     if encoder is None or isinstance(encoder, TransformerEncoderConfig):
-        rules = below(_ENCODER, r"encoder/layer_\1", _ENCODER_LAYER)
+        rules = below(_ENCODER, r"encoder/layer_\1", ENCODER_LAYER)
         return convert(state, (*_AROUND_THE_ENCODER, *rules), "LSTR", frozen=r"backbone/bn1/.*")
     rules = below(_ENCODER, r"encoder/layer_\1", (*GRAPH_LAYER[type(encoder)], *_FED))
     state, remarks = as_graph_state(state, encoder)
@@ -136,18 +135,3 @@ def _expected(model: LstrConfig) -> Expected:
     side = 64 * model.shrink  # parameters do not depend on the size of the image
     image, valid = jax.ShapeDtypeStruct((side, side, 3), jnp.float32), jax.ShapeDtypeStruct((side, side), jnp.bool_)
     return expected_variables(model.build(), (image, valid))
-
-
-def backbone_variables(state: Mapping[str, AnyArray], *, frozen_stem_norm: bool = False) -> dict[str, Any]:
-    """Return the variables of a `ResNet` from a torchvision state dict (basic or bottleneck blocks)."""
-    return convert(state, RESNET, "ResNet", frozen=r"bn1/.*" if frozen_stem_norm else "(?!)").variables
-
-
-def encoder_layer_params(state: Mapping[str, AnyArray]) -> dict[str, Any]:
-    """Return the parameters of `EncoderLayer` from those of `torch.nn.TransformerEncoderLayer`."""
-    return renamed_params(state, _ENCODER_LAYER)
-
-
-def decoder_layer_params(state: Mapping[str, AnyArray]) -> dict[str, Any]:
-    """Return the parameters of `DecoderLayer` from those of `torch.nn.TransformerDecoderLayer`."""
-    return renamed_params(state, _DECODER_LAYER)

@@ -5,14 +5,10 @@ The reference's head holds everything behind the image encoder: the BEV encoder,
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
 from tflane_jax.convert.bevformer import BEV_CONSTRUCTER
 from tflane_jax.convert.lanesegnet import branch
-from tflane_jax.convert.renaming import Rule, below, convert
+from tflane_jax.convert.renaming import Rule, below
 from tflane_jax.convert.toponet import ATTENTION, DEFORMABLE, FEED_FORWARD, LAYER, PLAIN_DECODER, REFERENCE
-from tflane_jax.geometry.namespace import AnyArray
 
 # Checkpoints hold embeddings of four levels; the only level has the first.
 _ENCODER: tuple[Rule, ...] = (("level_embeds", "levels", "first_row"), *BEV_CONSTRUCTER)
@@ -113,13 +109,3 @@ MAPTRV2_HEAD: tuple[Rule, ...] = (
     (r"(?:positional_encoding\..*|transformer\.(?:level_embeds|cams_embeds|can_bus_mlp\..*))", "", "unused"),
     (r"loss_(pv_)?seg\.loss_fn\.pos_weight", "", "unused"),
 )
-
-
-def map_head_params(state: Mapping[str, AnyArray]) -> dict[str, Any]:
-    """Return the parameters of `MapTr` without those of the image encoder, from those of MapTRHead."""
-    return convert(state, MAPTR_HEAD, "MapTR's head").variables["params"]
-
-
-def map_v2_head_params(state: Mapping[str, AnyArray]) -> dict[str, Any]:
-    """Return the parameters of `MapTrV2` without its encoder of images, from those of MapTRv2Head."""
-    return convert(state, MAPTRV2_HEAD, "MapTRv2's head").variables["params"]

@@ -139,18 +139,6 @@ def below(prefix: str, name: str, rules: Rules) -> tuple[Rule, ...]:
     return tuple((prefix + pattern, above + ours, kind) for pattern, ours, kind in moved)
 
 
-def renamed_params(state: Mapping[str, AnyArray], rules: Rules) -> dict[str, Any]:
-    """Return the parameters that a module's tensors become; raises UserError where no rule knows one."""
-    params: dict[str, Any] = {}
-    for name, tensor in state.items():
-        leaves = renamed(name, tensor, rules)
-        if leaves is None:
-            raise UserError(f"{name} is no tensor of this module")
-        for path, value in leaves.items():
-            put(params, path, value)
-    return params
-
-
 def renamed(name: str, tensor: AnyArray, rules: Rules) -> dict[str, Any] | None:
     """Return our leaves, by path, that a tensor becomes; None where no rule knows its name."""
     for pattern, ours, kind in rules:

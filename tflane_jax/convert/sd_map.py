@@ -1,15 +1,13 @@
 """Weights of the published SMERF: its map encoder, and the BEV encoder that attends to the map in every layer.
 
-Names are those of the published state dict (github.com/NVlabs/SMERF).
+Names are those of the published state dicts (github.com/NVlabs/SMERF). In a whole detector they stand below
+`map_encoder` and `bev_constructor` (`convert.hosts`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 from tflane_jax.convert.bevformer import BEV_CONSTRUCTER
-from tflane_jax.convert.renaming import Converted, Rule, below, convert
-from tflane_jax.geometry.namespace import AnyArray
+from tflane_jax.convert.renaming import Rule, below
 
 CROSS_ATTENTION: tuple[Rule, ...] = (
     (r"multihead_attn\.in_proj_(weight|bias)", r"attention/\1", "packed"),
@@ -32,23 +30,3 @@ SMERF_CONSTRUCTER: tuple[Rule, ...] = (
     (r"encoder\.layers\.(\d+)\.norms\.3\.(weight|bias)", r"encoder/layer_\1/feed_forward_norm/\2", "norm"),
     *BEV_CONSTRUCTER,
 )
-
-
-def convert_sd_map_encoder(state: Mapping[str, AnyArray]) -> Converted:
-    """Return the variables of `models.sd_map_encoder.SdMapEncoder` from those of the reference's MapGraphTransformer,
-    and an account of every tensor.
-
-    Raises:
-        UserError: a tensor that the encoder does not have.
-    """
-    return convert(state, SD_MAP_ENCODER, "SMERF's map encoder")
-
-
-def convert_smerf_bevformer(state: Mapping[str, AnyArray]) -> Converted:
-    """Return the variables of `models.bevformer.BevFormer` whose layers fuse `SdMapFusion` under the name
-    `sd_map_<layer>`, from SMERF's BEV constructer, and an account of every tensor.
-
-    Raises:
-        UserError: a tensor that the constructer does not have.
-    """
-    return convert(state, SMERF_CONSTRUCTER, "SMERF's BEVFormer")

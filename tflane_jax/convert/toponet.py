@@ -6,11 +6,7 @@ mmcv's layers: attentions and norms are numbered in the order in which a layer r
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
-from tflane_jax.convert.renaming import Rule, below, convert, renamed_params
-from tflane_jax.geometry.namespace import AnyArray
+from tflane_jax.convert.renaming import Rule, below
 
 DEFORMABLE: tuple[Rule, ...] = ((r"(\w+)\.(weight|bias)", r"\1/\2", "linear"),)
 ATTENTION: tuple[Rule, ...] = (
@@ -97,28 +93,3 @@ ELEMENTS: tuple[Rule, ...] = (
     (r"reg_branches\.(\d+)\.2\.(weight|bias)", r"box_\1/hidden/linear_1/\2", "linear"),
     (r"reg_branches\.(\d+)\.4\.(weight|bias)", r"box_\1/out/\2", "linear"),
 )
-
-
-def scene_graph_params(state: Mapping[str, AnyArray]) -> dict[str, Any]:
-    """Return the parameters of `SceneGraphFeedForward` from those of the reference's FFN_SGNN."""
-    return renamed_params(state, SCENE_GRAPH)
-
-
-def relationship_params(state: Mapping[str, AnyArray]) -> dict[str, Any]:
-    """Return the parameters of `RelationshipHead` from those of the reference's."""
-    return renamed_params(state, RELATIONSHIP)
-
-
-def element_decoder_params(state: Mapping[str, AnyArray]) -> dict[str, Any]:
-    """Return the parameters of `ElementDecoder` from those of CustomDeformableDETRHead."""
-    return renamed_params(state, ELEMENTS)
-
-
-def toponet_lane_params(state: Mapping[str, AnyArray]) -> dict[str, Any]:
-    """Return the parameters of `TopoNet.decode` from those of TopoNetHead."""
-    return convert(state, TOPONET_LANES, "TopoNet's lane head").variables["params"]
-
-
-def baseline_lane_params(state: Mapping[str, AnyArray]) -> dict[str, Any]:
-    """Return the parameters of `BevFormerDetr.decode`, less relationship heads, from those of LCDeformableDETRHead."""
-    return convert(state, BASELINE_LANES, "the baseline's lane head").variables["params"]

@@ -10,7 +10,6 @@ import numpy as np
 
 from tflane_jax.datasets.map_lines import MapLinesConfig
 from tflane_jax.errors import UserError
-from tflane_jax.files.tusimple import RowLanes
 from tflane_jax.geometry import BevGrid, PerceptionRange
 from tflane_jax.limits import Count, Positive, at_least
 from tflane_jax.markers.pixels import PixelConfig
@@ -164,16 +163,4 @@ class DrivenDataset(Protocol):
 
     def drives(self) -> Iterator[Log]:
         """Yield the logs, each once, in the order of the examples."""
-        ...
-
-
-class RoadImageDataset(IndexedExamples, Protocol):
-    """Front-view images with their lane lines."""
-
-    def example(self, index: int) -> RoadImage:
-        """Return one image with its lane lines; the same index always gives the same bits."""
-        ...
-
-    def truth(self, index: int) -> RowLanes:
-        """Return the labels of one image for TuSimple's metric: x in pixels at fixed rows."""
         ...

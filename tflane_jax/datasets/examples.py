@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 import warnings
+from functools import partial
 from operator import attrgetter
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 
 from tflane_jax.datasets.areas import crop_areas
 from tflane_jax.datasets.base import ExampleConfig, TruncationWarning
 from tflane_jax.datasets.ground_truth import lane_graph, traffic_elements
 from tflane_jax.datasets.map_lines import crop_map_lines
 from tflane_jax.datasets.marker_observations import marker_observations
-from tflane_jax.datasets.prepared_map import prepare_map
+from tflane_jax.datasets.prepared_map import PreparedMap, prepare_map
 from tflane_jax.geometry import PerceptionRange, invert_pose, pose_yaw, relative_pose, transform_points, yaw_pose
-from tflane_jax.scene import Example, TrafficFlow
+from tflane_jax.scene import Example, MarkerObservations, TrafficFlow
 from tflane_jax.scene.logs import Log, Tracks
-from tflane_jax.world.bev.sensor import hidden_cells, render_bev
+from tflane_jax.world.bev.sensor import BevSensorConfig, hidden_cells, render_bev
 from tflane_jax.world.cameras.sensor import render_cameras, visible_elements
 from tflane_jax.world.roads.sd_map import make_sd_map
 
@@ -91,26 +92,11 @@ def make_example(log: Log, keyframe: int, config: ExampleConfig) -> Example:
     ego_from_global = invert_pose(moment.global_from_ego)
     prepared = prepare_map(log.map, bike_lanes=config.bike_lanes == "include")
     boxes, buildings = occluder_boxes(log, keyframe), _buildings(log, ego_from_global)
-    sensor, rig = config.sensor, config.cameras
-    hidden = None if sensor is None else hidden_cells(sensor.grid, boxes, buildings)
-    lanes = lane_graph(
-        prepared.centerlines,
-        ego_from_global,
-        config.range,
-        capacity=config.lanes,
-        points=config.lane_points,
-        boxes=boxes,
-        buildings=buildings,
-    )
-    segments = lane_graph(
-        prepared.segments,
-        ego_from_global,
-        config.range,
-        capacity=config.segments,
-        points=config.segment_points,
-        boxes=boxes,
-        buildings=buildings,
-    )
+    rig = config.cameras
+    bev, hidden = _bev(log, keyframe, config.sensor, prepared, ego_from_global, boxes, buildings)
+    crop = partial(lane_graph, ego_from_global=ego_from_global, range_=config.range, boxes=boxes, buildings=buildings)
+    lanes = crop(prepared.centerlines, capacity=config.lanes, points=config.lane_points)
+    segments = crop(prepared.segments, capacity=config.segments, points=config.segment_points)
     areas, areas_dropped = crop_areas(
         prepared,
         ego_from_global,
@@ -150,32 +136,10 @@ def make_example(log: Log, keyframe: int, config: ExampleConfig) -> Example:
     )
     previous = log.keyframes[keyframe - 1] if keyframe > 0 else moment
     return Example(
-        bev=None
-        if sensor is None or hidden is None
-        else render_bev(
-            prepared.samples,
-            ego_from_global,
-            boxes,
-            buildings,
-            hidden,
-            weather=log.weather,
-            paint_wear=log.paint_wear,
-            log_seed=log.seed,
-            frame=keyframe,
-            config=sensor,
-        ),
+        bev=bev,
         hidden=hidden,
         traffic_flow=flow,
-        markers=None
-        if config.markers is None
-        else marker_observations(
-            log,
-            keyframe,
-            config.markers,
-            config.range,
-            bike_lanes=config.bike_lanes == "include",
-            cameras=config.cameras,
-        ),
+        markers=_markers(log, keyframe, config),
         sd_map=sd_map,
         lanes=lanes.graph,
         segments=segments.graph,
@@ -186,6 +150,42 @@ def make_example(log: Log, keyframe: int, config: ExampleConfig) -> Example:
         cameras=None if rig is None else render_cameras(log, keyframe, rig),
         map_lines=map_lines,
     )
+
+
+def _bev(
+    log: Log,
+    keyframe: int,
+    sensor: BevSensorConfig | None,
+    prepared: PreparedMap,
+    ego_from_global: Float[np.ndarray, "4 4"],
+    boxes: Float[np.ndarray, "k 7"],
+    buildings: Float[np.ndarray, "b 5"],
+) -> tuple[UInt8[np.ndarray, "h w 4"] | None, Bool[np.ndarray, "h w"] | None]:
+    """Return the BEV evidence and the cells out of sight; None for both without a sensor."""
+    if sensor is None:
+        return None, None
+    hidden = hidden_cells(sensor.grid, boxes, buildings)
+    bev = render_bev(
+        prepared.samples,
+        ego_from_global,
+        boxes,
+        buildings,
+        hidden,
+        weather=log.weather,
+        paint_wear=log.paint_wear,
+        log_seed=log.seed,
+        frame=keyframe,
+        config=sensor,
+    )
+    return bev, hidden
+
+
+def _markers(log: Log, keyframe: int, config: ExampleConfig) -> MarkerObservations | None:
+    """Return what is observed of the markers; None without their configuration."""
+    if config.markers is None:
+        return None
+    bike_lanes, cameras = config.bike_lanes == "include", config.cameras
+    return marker_observations(log, keyframe, config.markers, config.range, bike_lanes=bike_lanes, cameras=cameras)
 
 
 def _buildings(log: Log, ego_from_global: np.ndarray) -> Float[np.ndarray, "b 5"]:

@@ -56,14 +56,3 @@ def row_lanes(
     columns = curve_columns(curves[:, 2:], fraction[None]) * width
     inside = (fraction >= curves[:, :1]) & (fraction <= curves[:, 1:2])
     return RowLanes(np.where(inside, columns, NO_POINT))
-
-
-def pixel_points(
-    prediction: CurvePrediction, *, height: int, width: int, count: int = 100
-) -> list[Int[np.ndarray, "p 2"]]:
-    """Return pixels (column, row) of each detected lane for drawing, at `count` rows of its extent."""
-    curves = np.asarray(prediction.curves, np.float64)[detected(prediction)]
-    rows = np.linspace(curves[:, 0], curves[:, 1], count, axis=-1)
-    columns = curve_columns(curves[:, 2:], rows)
-    pixels = np.stack([columns * width, rows * height], -1).astype(np.int64)
-    return [lane[(lane[:, 0] > 0) & (lane[:, 0] < width)] for lane in pixels]

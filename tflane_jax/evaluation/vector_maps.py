@@ -51,20 +51,6 @@ def dividers(segments: LaneGraph) -> list[Float[np.ndarray, "p 2"]]:
     return [lines[i] for i in sorted(kept)]
 
 
-def map_lines(
-    points: Float[np.ndarray, "l p d"], classes: Int[np.ndarray, " l"], valid: Bool[np.ndarray, " l"]
-) -> MapTruth:
-    """Return the valid lines of padded arrays as truth; only x and y of the points are kept.
-
-    Args:
-        points: metres; closed lines repeat their first vertex.
-        classes: index into `metrics.map_matching.LINE_CLASSES`.
-        valid: padding is False.
-    """
-    kept = np.asarray(valid)
-    return MapTruth(np.asarray(points)[kept][..., :2], np.asarray(classes)[kept])
-
-
 def map_detections(
     points: Float[np.ndarray, "q p d"],
     classes: Int[np.ndarray, " q"],

@@ -11,7 +11,6 @@ from tflane_jax.geometry.cameras import (
     project,
     resize_intrinsics,
 )
-from tflane_jax.geometry.distances import chamfer, discrete_frechet
 from tflane_jax.geometry.polylines import (
     arc_length,
     clip_to_range,
@@ -35,10 +34,8 @@ __all__ = [
     "BevGrid",
     "PerceptionRange",
     "arc_length",
-    "chamfer",
     "clip_to_range",
     "crop_intrinsics",
-    "discrete_frechet",
     "ground_points",
     "inside_image",
     "invert_pose",

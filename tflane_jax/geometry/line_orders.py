@@ -3,7 +3,7 @@
 A line can be drawn from either end, and a ring from any point and in either direction. The reference code has five
 ways to list the orders of a ring (`gt_shift_pts_pattern` v0 to v4). v0, v1 and v4 shift the points of the ring after
 resampling: `point_orders`, which runs on the device. v2 and v3 start at each vertex of the original ring and resample
-from there: `vertex_orders`, for which the original ring is needed.
+from there, for which the original ring is needed.
 
 The loss uses `point_orders`, of rings that were resampled from their first corner (`geometry.rings`): it does not
 depend on the vertex at which the source starts a ring, and the truth of a frame stays L x P points. The orders of v2
@@ -18,8 +18,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float
 
-from tflane_jax.geometry.namespace import AnyArray, ArrayT, namespace
-from tflane_jax.geometry.polylines import resample_lines
+from tflane_jax.geometry.namespace import ArrayT, namespace
 
 Ways = Literal["one", "both"]
 """Directions in which a ring is listed."""
@@ -70,18 +69,3 @@ def point_orders(
     directed = xp.zeros(lines, bool) if directed is None else directed
     amount = xp.where(directed, 1, xp.where(closed, of_ring, 2))
     return found, xp.arange(number)[None] < amount[:, None]
-
-
-def vertex_orders(vertices: Float[AnyArray, "n d"], points: int, ways: Ways = "one") -> Float[np.ndarray, "o p d"]:
-    """Return the orders of one line before resampling, each resampled to P points: v2 (v3: `ways="both"`).
-
-    Args:
-        vertices: of the original line; the line is a ring if the last one equals the first.
-        points: P.
-        ways: of a ring; an open line has two orders.
-    """
-    vertices = np.asarray(vertices)
-    if not np.array_equal(vertices[0], vertices[-1]):
-        return resample_lines([vertices, vertices[::-1]], points)
-    orders = order_indices(len(vertices), ways)
-    return resample_lines([vertices[order] for order in orders], points)

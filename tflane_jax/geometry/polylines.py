@@ -1,4 +1,4 @@
-"""Polylines on the host: arc length, resampling and clipping of ragged lines (numpy)."""
+"""Polylines on the host: arc length, resampling, clipping and stacking of ragged lines (numpy)."""
 
 from __future__ import annotations
 
@@ -83,6 +83,26 @@ def resample_lines(lines: Sequence[Float[AnyArray, "_ d"]], count: int) -> Float
     weight = ((distances - along[start]) / np.where(length > 0.0, length, 1.0))[..., None]
     weight = np.clip(weight, 0.0, 1.0)
     return np.where(weight == 1.0, points[stop], points[start] + weight * (points[stop] - points[start]))
+
+
+def pad_lines(
+    lines: Sequence[Float[AnyArray, "_ d"]] | Float[AnyArray, "l n d"], dims: int = 3
+) -> Float[np.ndarray, "l n d"]:
+    """Stack ragged polylines into one float64 array by repeating each line's last vertex (numpy).
+
+    The repetition changes neither the discrete Fréchet distance nor the vertex nearest to a point. It does change means
+    over vertices, so the Chamfer distance needs the true counts. Raises ValueError for a line without points.
+    """
+    if len(lines) == 0:
+        return np.zeros((0, 1, dims))
+    sizes = np.array([len(line) for line in lines])
+    if sizes.min() == 0:
+        raise ValueError(f"polyline {int(sizes.argmin())} has no points")
+    if (sizes == sizes[0]).all():
+        return np.asarray(lines, np.float64)
+    first = np.cumsum(sizes) - sizes
+    index = first[:, None] + np.minimum(np.arange(sizes.max()), sizes[:, None] - 1)
+    return np.concatenate([np.asarray(line, np.float64) for line in lines])[index]
 
 
 def nearest_on(line: Float[AnyArray, "n d"], place: Float[AnyArray, "2"]) -> tuple[int, float, float]:

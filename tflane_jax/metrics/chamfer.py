@@ -1,7 +1,7 @@
 """Chamfer distances of many pairs of polylines, measured only where they can be small (numpy).
 
-`tflane_jax.geometry.distances.chamfer` is the definition. This file takes ragged lines, and first a lower bound that is
-a hundred times cheaper than the distance and excludes nearly all pairs of a frame.
+The distance is half the sum of the mean distances from each vertex to the nearest vertex of the other line: not
+squared, blind to direction. Lines are ragged; a lower bound that is a hundred times cheaper excludes nearly all pairs.
 """
 
 from __future__ import annotations

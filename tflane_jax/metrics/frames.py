@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from tflane_jax.errors import UserError
-from tflane_jax.geometry.distances import pad_lines
+from tflane_jax.geometry.polylines import pad_lines
 
 # By which a confidence may miss 0 to 1, such as the sum of a softmax.
 _ROUNDING = 1e-6

@@ -1,19 +1,17 @@
 """BEVFormer: feature maps of several cameras, and the previous frame's BEV features, to BEV features.
 
 Source: Li et al. 2022, and TopoNet's "BEV constructer" (docs/reference/bevformer.md). The module encodes one frame; the
-memory is an explicit carry. `encode_sequence` scans over frames, `step` encodes one frame, with equal results.
+memory is an explicit carry.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import struct
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
@@ -206,33 +204,3 @@ def can_bus_vector(cameras: CameraViews) -> Float[Array, " m"]:
             "(nuScenes, OpenLane-V2), or task.model.encoder.bev.motion to moved"
         )
     return jnp.asarray(vehicle.can_bus).at[:3].set(0.0).at[-1].set(0.0)
-
-
-@struct.dataclass
-class BevFrame:
-    """Inputs of the encoder for one frame, or for T frames with a leading axis.
-
-    Attributes:
-        features: levels (V, h, w, C), finest first.
-        cameras: the V views.
-        previous_from_ego: (4, 4) pose of this ego frame in the previous one.
-        has_previous: () the previous frame belongs to the same sequence.
-    """
-
-    features: Sequence[Float[Array, "v _h _w c"]]
-    cameras: CameraViews
-    previous_from_ego: Float[Array, "4 4"]
-    has_previous: Bool[Array, ""]
-
-
-def step(model: BevFormer, variables: Any, memory: BevMemory, frame: BevFrame) -> tuple[BevMemory, Array]:
-    """Return the memory for the next frame and the BEV features (h, w, c) of this one."""
-    memory = memory.replace(valid=memory.valid & frame.has_previous)  # pyright: ignore[reportAttributeAccessIssue]
-    bev: Any = model.apply(variables, list(frame.features), frame.cameras, memory, frame.previous_from_ego)
-    return BevMemory(bev, jnp.ones((), bool)), bev
-
-
-def encode_sequence(model: BevFormer, variables: Any, frames: BevFrame) -> Float[Array, "t y x c"]:
-    """Return the BEV features of T successive frames; each frame receives the memory of the one before."""
-    start = BevMemory.empty(model.config)
-    return lax.scan(lambda memory, frame: step(model, variables, memory, frame), start, frames)[1]

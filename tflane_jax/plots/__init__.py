@@ -1,8 +1,6 @@
 """Pictures and tables. matplotlib (extra `plot`) is imported with the first figure, not with this package."""
 
 from tflane_jax.plots.attention import (
-    draw_attention_matrix,
-    draw_lane_attention,
     draw_spatial_mask,
     draw_temporal_mask,
 )
@@ -20,9 +18,7 @@ __all__ = [
     "Findings",
     "add_legend",
     "dataset_summary",
-    "draw_attention_matrix",
     "draw_bars",
-    "draw_lane_attention",
     "draw_lane_bands",
     "draw_lanes",
     "draw_prediction",

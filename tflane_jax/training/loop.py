@@ -36,7 +36,7 @@ from tflane_jax.training.run_folder import CurrentForm, Start, check_unchanged, 
 from tflane_jax.training.schedule import OptimConfig, make_optimizer, scaled_to_batch
 from tflane_jax.training.sharding import placed
 from tflane_jax.training.state import init_states, of_all_seeds, per_seed, state_of
-from tflane_jax.training.step import compiled_update, update_all
+from tflane_jax.training.step import UpdateForm, compiled_update, update_all
 from tflane_jax.training.task import Trainable
 
 Evaluate = Callable[[Params], dict[str, float]]
@@ -216,9 +216,8 @@ def train(
             batch = next(feed, None)
         update: Any = None
         if batch is not None:  # a run that is complete has no next batch
-            form: dict[str, Any] = {"donate": len(states) == 1, "mesh": mesh, "accumulate": config.accumulate}
-            form["shard_state"] = config.shard_state
-            update = compiled_update(task, optim, config.steps, states[0], batch[0], **form)
+            form = UpdateForm(len(states) == 1, mesh, config.accumulate, config.shard_state)
+            update = compiled_update(task, optim, config.steps, states[0], batch[0], form)
         compile_seconds = time.perf_counter() - began
         ready()
         stop.after_the_step()

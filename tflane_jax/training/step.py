@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import jax
@@ -36,16 +37,25 @@ Metrics = dict[str, jax.Array]
 UpdateStep = Callable[[TrainState, Any], tuple[TrainState, Metrics]]
 
 
-def make_update_step(
-    task: Trainable,
-    optim: OptimConfig,
-    steps: int,
-    *,
-    donate: bool = True,
-    mesh: Mesh | None = None,
-    accumulate: int = 1,
-    shard_state: bool = False,
-) -> UpdateStep:
+@dataclass(frozen=True)
+class UpdateForm:
+    """How an update runs on the devices.
+
+    Attributes:
+        donate: give the memory of the input state to the new one; the input state cannot be used again.
+        mesh: devices on which the new state and the metrics are replicated; None for one device. (For a state that they
+            share, see `shard_state`.)
+        accumulate: parts of a batch, see `TrainingConfig.accumulate`.
+        shard_state: the devices share the state, see `sharding.placed`.
+    """
+
+    donate: bool = True
+    mesh: Mesh | None = None
+    accumulate: int = 1
+    shard_state: bool = False
+
+
+def make_update_step(task: Trainable, optim: OptimConfig, steps: int, form: UpdateForm = UpdateForm()) -> UpdateStep:
     """Return the jitted update (state, batch) -> (state, metrics) of one seed.
 
     Metrics: `loss`, the task's terms as `loss/<term>` (a name with a group, "matching/lanes", stays as it is),
@@ -56,17 +66,14 @@ def make_update_step(
     Args:
         task, optim: what to train, and how.
         steps: of the whole run.
-        donate: give the memory of the input state to the new one; the input state cannot be used again.
-        mesh: of several devices, on each of which the new state and the metrics are.
-        accumulate: parts of a batch, see `TrainingConfig.accumulate`.
-        shard_state: the devices share the state, see `sharding.placed`.
+        form: see `UpdateForm`.
     """
-    division = Division(mesh if shard_state else None)
-    update = _update(task, optim, steps, accumulate, division)
-    loops = accumulate > 1 or getattr(task, "loops", False)
+    division = Division(form.mesh if form.shard_state else None)
+    update = _update(task, optim, steps, form.accumulate, division)
+    loops = form.accumulate > 1 or getattr(task, "loops", False)
     update = _traced_once(with_fast_convolutions(update) if loops else update)
-    placed: Any = {} if mesh is None or shard_state else {"out_shardings": everywhere(mesh)}
-    return jax.jit(update, donate_argnums=0 if donate else (), **placed)
+    placed: Any = {} if form.mesh is None or form.shard_state else {"out_shardings": everywhere(form.mesh)}
+    return jax.jit(update, donate_argnums=0 if form.donate else (), **placed)
 
 
 def update_all(
@@ -91,25 +98,21 @@ def compiled_update(
     steps: int,
     state: TrainState,
     batch: Any,
-    *,
-    donate: bool = True,
-    mesh: Mesh | None = None,
-    accumulate: int = 1,
-    shard_state: bool = False,
+    form: UpdateForm = UpdateForm(),
 ) -> UpdateStep:
     """Return the update of one seed, compiled for the shapes of a state and a batch.
 
     A process compiles it once: trainings that differ only in seeds or starting parameters use the same program.
 
     Args:
-        task, optim, steps, donate, accumulate, shard_state: see `make_update_step`.
-        state, batch: with `mesh` as `sharding.placed` and `devices.divided` return them.
-        mesh: see `devices.training_mesh`.
+        task, optim, steps: see `make_update_step`.
+        state, batch: with `form.mesh` as `sharding.placed` and `devices.divided` return them.
+        form: see `UpdateForm`; its mesh, `devices.training_mesh`.
     """
     leaves, tree = jax.tree.flatten((state, batch))
-    placed = tuple(leaf.sharding if mesh is not None else None for leaf in leaves)
+    placed = tuple(leaf.sharding if form.mesh is not None else None for leaf in leaves)
     types = tuple(jax.typeof(leaf) for leaf in leaves)
-    return _compiled(task, optim, steps, donate, tree, types, placed, mesh, accumulate, shard_state)
+    return _compiled(task, optim, steps, form, tree, types, placed)
 
 
 @functools.lru_cache(maxsize=16)
@@ -117,22 +120,18 @@ def _compiled(
     task: Trainable,
     optim: OptimConfig,
     steps: int,
-    donate: bool,
+    form: UpdateForm,
     tree: Any,
     types: tuple[Any, ...],
     placed: tuple[Any, ...],
-    mesh: Mesh | None,
-    accumulate: int,
-    shard_state: bool,
 ) -> UpdateStep:
-    form: dict[str, Any] = {"donate": donate, "mesh": mesh, "accumulate": accumulate, "shard_state": shard_state}
-    update: Any = make_update_step(task, optim, steps, **form)
+    update: Any = make_update_step(task, optim, steps, form)
     shapes = [
         jax.ShapeDtypeStruct(each.shape, each.dtype, weak_type=each.weak_type, sharding=where)
         for each, where in zip(types, placed, strict=True)
     ]
     arguments = jax.tree.unflatten(tree, shapes)
-    return compiled(update, *arguments, what="the update step", context=functools.partial(active, mesh))
+    return compiled(update, *arguments, what="the update step", context=functools.partial(active, form.mesh))
 
 
 def _traced_once(update: UpdateStep) -> UpdateStep:

@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from tflane_jax.ablations.declaration import Claim, Declaration
-from tflane_jax.config import RunConfig, apply_overrides, load_config
+from tflane_jax.config import RunConfig, load_config
+from tflane_jax.config_overrides import apply_overrides
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,102 @@
+"""Settings of a configuration changed by arguments, `--a.b.c value`."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import difflib
+import io
+import re
+from collections.abc import Sequence
+
+from tflane_jax.config import RunConfig, with_reference_batch
+from tflane_jax.config_io import choices, settings, with_setting
+from tflane_jax.errors import UserError
+from tflane_jax.limits import check_settings
+
+
+def apply_overrides(config: RunConfig, arguments: Sequence[str]) -> RunConfig:
+    """Return the configuration with settings changed by `--a.b.c value` arguments, typed by tyro.
+
+    A learning rate that is scaled without `optim.reference_batch` was chosen for the batch of `config`.
+
+    An argument that chooses an optional part, or the class of a part, is applied first, wherever it appears:
+    `--a.b None`, `--a.b default` or `--a.b NameOfItsClass`; the part then has its defaults.
+
+    Raises:
+        UserError: an unknown setting (with the names closest to it), a value of the wrong type, or one that breaks a
+            limit.
+    """
+    if not arguments:
+        return config
+    import tyro
+
+    given = config
+    config, arguments = _choose_parts(config, arguments)
+    _check_names(config, arguments)
+    output = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(output), contextlib.redirect_stdout(output):
+            changed = tyro.cli(RunConfig, default=config, args=list(arguments), config=(tyro.conf.AvoidSubcommands,))
+    except SystemExit as error:
+        raise UserError(_without_boxes(output.getvalue())) from error
+    changed = with_reference_batch(changed, given)
+    check_settings(changed, "--")
+    return changed
+
+
+def override_names(config: RunConfig) -> list[str]:
+    """Return the dotted names of all settings that arguments can change."""
+    return [name for name, value in settings(config) if not dataclasses.is_dataclass(value)]
+
+
+def _choose_parts(config: RunConfig, arguments: Sequence[str]) -> tuple[RunConfig, list[str]]:
+    """Return the configuration with the chosen parts, and the remaining arguments."""
+    left = list(arguments)
+    while chosen := [i for i, argument in enumerate(left) if choices(config, _setting(argument))]:
+        # Outer parts before inner ones.
+        at = min(chosen, key=lambda i: _setting(left[i]).count("."))
+        name, kinds = _setting(left[at]), choices(config, _setting(left[at]))
+        _, equals, value = left.pop(at).partition("=")
+        if not equals:
+            value = left.pop(at) if at < len(left) else ""
+        if value not in kinds:
+            raise UserError(
+                f"setting --{name} takes {', '.join(kinds)}, not {value!r}; its own settings are --{name}..."
+            )
+        try:
+            config = with_setting(config, name, kinds[value]())
+        except TypeError:
+            raise UserError(f"{value} has no defaults for all of its settings: choose it in a config file") from None
+    return config, left
+
+
+def _setting(argument: str) -> str:
+    """Return the name of the setting that an argument changes; "" for a value."""
+    return argument.partition("=")[0].removeprefix("--").replace("-", "_") if argument.startswith("--") else ""
+
+
+def _check_names(config: RunConfig, arguments: Sequence[str]) -> None:
+    known = override_names(config)
+    for argument in arguments:
+        name = _setting(argument)
+        if name and name not in known and name.replace(".no_", ".") not in known:
+            close = _closest(name, known)
+            hint = f"did you mean {' or '.join(f'--{c}' for c in close)}?" if close else "see --help for all settings"
+            raise UserError(f"unknown setting --{name}: {hint}")
+
+
+def _closest(name: str, known: list[str]) -> list[str]:
+    """Return up to three similar names: compared as a whole, else by their last parts."""
+    whole = difflib.get_close_matches(name, known, 3, 0.75)
+    last = name.rpartition(".")[2]
+    parts = difflib.get_close_matches(last, sorted({k.rpartition(".")[2] for k in known}), 3, 0.75)
+    return (whole or [k for part in parts for k in known if k.rpartition(".")[2] == part])[:3]
+
+
+def _without_boxes(text: str) -> str:
+    """Return tyro's error message as one line, without frame, title and hints."""
+    # tyro prints a title, a rule (unless framed), the message, a rule, hints.
+    lines = [re.sub(r"[│─╭╮╰╯]|-{3,}", " ", line).strip() for line in text.splitlines()[1:]]
+    paragraphs = re.split(r"\n{2,}", "\n".join(lines).strip())
+    return paragraphs[0].replace("\n", " ")

@@ -256,7 +256,7 @@ def test_several_seeds_are_evaluated_with_mean_and_deviation(config, tmp_path):
         ),
         (["train", "--config", "CONFIG", "--optim.learning_rate", "1"], "unknown setting --optim.learning_rate"),
         (["train", "--config", "CONFIG", "--optim.ll", "1"], "did you mean --optim.lr"),
-        (["train", "--config", "CONFIG", "--optim.lr", "high"], "could not convert string to float: 'high'"),
+        (["train", "--config", "CONFIG", "--optim.lr", "high"], "--optim.lr is 'high': it must be a number"),
         (["train", "--config", "CONFIG:no_such"], "has no ablation no_such, only baseline"),
         (["eval", "nowhere"], "nowhere does not exist: the first argument is a run folder"),
         (["eval", "RUN", "--checkpoint", "77"], "has no checkpoint of step 77, only 2, 4"),

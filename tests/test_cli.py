@@ -249,11 +249,7 @@ def test_several_seeds_are_evaluated_with_mean_and_deviation(config, tmp_path):
         (["train", "--config", "nowhere.py"], "config file nowhere.py does not exist"),
         (["train", "--resume"], "say which run to resume"),
         (["train", "--resume", "--out", "nowhere"], "nowhere holds no run"),
-        (
-            ["train", "--resume", "--out", "RUN", "--training.steps", "9"],
-            "leave --training.steps out (to train longer, or with other settings, start another run with "
-            "--training.init-from RUN)",
-        ),
+        (["train", "--resume", "--out", "RUN", "--training.steps", "9"], "another run with --training.init-from RUN"),
         (["train", "--config", "CONFIG", "--optim.learning_rate", "1"], "unknown setting --optim.learning_rate"),
         (["train", "--config", "CONFIG", "--optim.ll", "1"], "did you mean --optim.lr"),
         (["train", "--config", "CONFIG", "--optim.lr", "high"], "--optim.lr is 'high': it must be a number"),

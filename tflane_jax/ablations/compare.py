@@ -84,6 +84,7 @@ def compare(
     results = Results(tuple(configs), tuple(seeds), tests)
     trained = without_failures(plan, failures)
     failures += evaluate_runs(trained, results)
+    trained = without_failures(plan, failures)
     results.failed.update(reasons(plan, failures))
     written = [save_plan(plan, failures, results, out)]
     if not results.scores:

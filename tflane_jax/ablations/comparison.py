@@ -12,7 +12,7 @@ from jaxtyping import Float
 from tflane_jax.ablations.statistics import holm, paired_difference
 
 Scores = dict[str, float]
-"""Metrics by "group/name", as `tasks.Evaluation.scores` returns them."""
+"""Metrics by "group/name", as `evaluation.results.Evaluation.scores` returns them."""
 
 
 @dataclass(frozen=True)

@@ -128,7 +128,7 @@ def lane_graph_loss(
     size: Int[Array, "b 2"] | None = None,
     control_points: int | None = None,
 ) -> tuple[Float[Array, ""], Report]:
-    """Return the loss of a batch and its terms; lanes and elements take one host call each for matching.
+    """Return the loss of a batch and its terms; lanes and elements take one call of `match` each.
 
     Args:
         prediction: outputs of every decoder layer, leading axes (batch, layer). A topology may have the last layers
@@ -152,7 +152,7 @@ def lane_graph_loss(
     # Padding may hold NaN; clear it, so that 0 * padding is 0.
     lanes = lanes.replace(points=jnp.where(lanes.valid[..., None, None], lanes.points, 0.0))  # pyright: ignore
     cost = jax.vmap(lambda p, g: matching_cost(p, g, config, control_points))(prediction.centerlines, lanes)
-    assignment = match(cost, lanes.valid[:, None], config.matcher)  # (B, D, N): one host call
+    assignment = match(cost, lanes.valid[:, None], config.matcher)  # (B, D, N): one call of `match`
     terms = lane_losses(prediction.centerlines, assignment, lanes, config, control_points)
     report = {"matching/lanes": matched(assignment)}
     if prediction.elements is not None:

@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
-from tflane_jax.ablations.comparison import Variant, compact
+from tflane_jax.ablations.comparison import compact
 from tflane_jax.config import RunConfig, apply_overrides
 from tflane_jax.errors import UserError
 from tflane_jax.plots.tables import format_table, save_table
@@ -77,8 +77,8 @@ def sweep(
     metrics = metrics or [name for name in task.compared if name in known]
     rows = []
     for i, value in enumerate(values):
-        variants = [Variant(name, tuple(by_value[i])) for name, by_value in scores.items()]
-        rows += [{setting: value} | row for row in compact(variants, metrics)]
+        found = compact({name: by_value[i] for name, by_value in scores.items()}, metrics)
+        rows += [{setting: value} | row for row in found]
     title = f"{protocol}, test split, {which} checkpoint, percent (mean ± std over seeds)"
     print("\n" + format_table(rows, title=title))
     out.mkdir(parents=True, exist_ok=True)

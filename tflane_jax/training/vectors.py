@@ -1,4 +1,4 @@
-"""Learned parameters as a few long vectors, each of which one fused operation updates.
+"""Learned parameters as a few long vectors, each updated by one fused operation.
 
 A small model has 300 leaves. Guard, clipping, moments, decay and average of every leaf apart are thousands of
 operations that take a third of a step; on vectors they are a few dozen. Users and checkpoints see trees.

@@ -15,11 +15,6 @@ from tflane_jax.plots.figure import new_figure, save_figure
 pytest.importorskip("matplotlib")
 
 
-@pytest.fixture
-def ax():
-    return new_figure()[1][0, 0]
-
-
 def test_lines_join_lanes_and_attended_road_users(ax):
     example = fake_example(padding=np.nan)
     weights = np.asarray([[0.0, 0.6, 0.9], [0.3, 0.01, np.nan]])

@@ -13,7 +13,6 @@ from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Float, Int
 
 from tflane_jax.geometry.bezier import bezier_fit
@@ -23,13 +22,12 @@ from tflane_jax.losses.common import (
     HostLossConfig,
     Report,
     Terms,
+    class_losses,
     edge_loss,
-    focal,
     last_layer,
     last_layers,
     matched,
     positives,
-    quality_focal,
     total,
 )
 from tflane_jax.losses.costs import focal_cost, pairwise_l1
@@ -251,13 +249,8 @@ def _lane_sums(
     # Index `queries` lies outside, so unmatched targets write nowhere.
     query = jnp.where(assignment.matched, assignment.query, len(logits))
     error = jnp.abs(_lines(points[assignment.query], control_points) - _lines(lanes.points, control_points)).sum(-1)
-    if config.class_target == "one":
-        is_lane = jnp.zeros(logits.shape).at[query, 0].set(1.0, mode="drop")
-        classes = focal(logits, is_lane, config.alpha, config.gamma)
-    else:
-        quality = lax.stop_gradient(lane_quality(points[assignment.query], lanes.points))
-        target = jnp.zeros(logits.shape).at[query, 0].set(quality, mode="drop")
-        classes = quality_focal(logits, target, config.gamma)
+    quality = None if config.class_target == "one" else lane_quality(points[assignment.query], lanes.points)
+    classes = class_losses(logits, query, 0, quality, config.alpha, config.gamma)
     return classes.sum(), jnp.where(assignment.matched, error, 0.0).sum()
 
 

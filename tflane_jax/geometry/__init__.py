@@ -19,6 +19,7 @@ from tflane_jax.geometry.polylines import (
     resample,
     resample_lines,
     sample_at,
+    segment_distances,
 )
 from tflane_jax.geometry.poses import (
     invert_pose,
@@ -27,6 +28,7 @@ from tflane_jax.geometry.poses import (
     pose_yaw,
     relative_pose,
     transform_points,
+    wrap_angle,
     yaw_pose,
 )
 from tflane_jax.geometry.ranges import BevGrid, PerceptionRange
@@ -52,6 +54,8 @@ __all__ = [
     "resample_lines",
     "resize_intrinsics",
     "sample_at",
+    "segment_distances",
     "transform_points",
+    "wrap_angle",
     "yaw_pose",
 ]

@@ -73,9 +73,9 @@ def draw_attention_matrix(
     ax.set_ylabel("lane query", fontsize=8)
 
 
-def draw_temporal_mask(ax: Axes, frame_valid: Bool[Array, "t n"], *, title: str = "temporal mask") -> None:
+def draw_temporal_mask(ax: Axes, frame_valid: Bool[Array, "t n"]) -> None:
     """Draw which frames of each road user are attended to (light), oldest frame on the left."""
-    _grid(ax, np.asarray(frame_valid), title)
+    _grid(ax, np.asarray(frame_valid), "temporal mask")
     ax.set_xlabel("frame, oldest first", fontsize=8)
     ax.set_ylabel("road user", fontsize=8)
 

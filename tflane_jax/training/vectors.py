@@ -204,3 +204,8 @@ def any_in_leaf(vector: Bool[Array, " n"], layout: Layout, group: str) -> Bool[A
         rows.astype(jnp.int32), leaf_of_row, num_segments=len(members), indices_are_sorted=True
     )
     return jnp.broadcast_to((leaves > 0)[leaf_of_row, None], (len(rows), ROW)).reshape(-1)
+
+
+def is_vectors(node: Any) -> bool:
+    """Return whether a node of a tree is `Vectors`."""
+    return isinstance(node, Vectors)

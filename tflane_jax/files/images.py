@@ -68,7 +68,7 @@ def list_photos(paths: Iterable[Path], suffixes: tuple[str, ...] = PHOTO_SUFFIXE
 
 
 def unreadable(path: Path) -> str | None:
-    """Return why a path is none of a file; None if it is one. Devices are none: they may never end."""
+    """Return why a path cannot be read as a file; None if it can. Devices are refused: they may never end."""
     try:
         mode = path.stat().st_mode
     except OSError as error:

@@ -109,7 +109,7 @@ def _maptr(sampling: Sampling, measure: Measure = "chamfer", dims: Dims = 2) -> 
         metrics=partial(VectorMapMetrics, sampling, measure, dims),
         columns=("mAP", *(f"AP_{name}" for name in LINE_CLASSES)),
         formats=("MapTR",),
-        remarks=remarks.map_lines,
+        remarks=remarks.units,
         groups={"occlusion": grouped, "distance": partial(grouped, partition=ByDistance())},
     )
 
@@ -137,7 +137,7 @@ PROTOCOLS: dict[str, ScoringProtocol] = {
         metrics=CenterlineFScore,
         columns=("F_score", "F_recall", "F_precision"),
         groups={},
-        remarks=remarks.centerline_units,
+        remarks=remarks.units,
     ),
     "maptr": _maptr("maptr"),
     "maptrv2": _maptr("maptrv2"),

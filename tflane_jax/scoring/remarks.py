@@ -30,12 +30,15 @@ def centerlines(predictions: Mapping[Any, LaneDetections], truth: Mapping[Any, L
     return [
         *_other_counts("predicted centerlines", _lines(predictions, lambda one: one.points), CENTERLINE_POINTS),
         *_other_counts("true centerlines", _lines(truth, lambda one: one.points), CENTERLINE_POINTS),
-        *centerline_units(predictions, truth),
+        *units(predictions, truth),
     ]
 
 
-def centerline_units(predictions: Mapping[Any, LaneDetections], truth: Mapping[Any, LaneTruth]) -> list[str]:
-    """Return a remark where centerlines seem to be of other units."""
+def units(
+    predictions: Mapping[Any, LaneDetections] | Mapping[Any, MapDetections],
+    truth: Mapping[Any, LaneTruth] | Mapping[Any, MapTruth],
+) -> list[str]:
+    """Return a remark where centerlines or lines of a map seem to be of other units."""
     return _units(_lines(predictions, lambda one: one.points), _lines(truth, lambda one: one.points))
 
 
@@ -50,11 +53,6 @@ def segments(predictions: Mapping[Any, SegmentDetections], truth: Mapping[Any, S
     areas = _other_counts("predicted areas", _lines(predictions, lambda one: one.areas.points), AREA_POINTS)
     units = _units(_lines(predictions, lambda one: one.lanes.points), _lines(truth, lambda one: one.lanes.points))
     return [*(remark for remarks in counts for remark in remarks), *areas, *units]
-
-
-def map_lines(predictions: Mapping[Any, MapDetections], truth: Mapping[Any, MapTruth]) -> list[str]:
-    """Return a remark where lines seem to be of other units."""
-    return _units(_lines(predictions, lambda one: one.points), _lines(truth, lambda one: one.points))
 
 
 def rows(predictions: Mapping[Any, RowLanes], truth: Mapping[Any, RowLanes]) -> list[str]:

@@ -1,8 +1,10 @@
-"""Where the reference data lies, and skipping where it does not."""
+"""What tests of several packages use: reference data (skipped where absent), random arrays, exact comparison."""
 
 import os
 from pathlib import Path
 
+import jax
+import numpy as np
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -19,3 +21,23 @@ def shared_path(relative: str) -> Path:
     if not path.exists():
         pytest.skip(f"needs {relative} under TFLANE_SHARED (looked in {shared_root()})")
     return path
+
+
+def assert_same(one, other):
+    """Assert that the leaves of two trees are exactly equal; NaN equals NaN."""
+    jax.tree.map(np.testing.assert_array_equal, one, other)
+
+
+def random_array(seed, *shape):
+    """Return normal numbers, float32, on the device."""
+    return jax.numpy.asarray(np.random.default_rng(seed).normal(size=shape).astype(np.float32))
+
+
+def random_mask(seed, *shape):
+    """Return fair coin flips, bool, on the device."""
+    return jax.numpy.asarray(np.random.default_rng(seed).random(shape) < 0.5)
+
+
+def random_photo(height, width):
+    """Return noise as an image, uint8."""
+    return np.random.default_rng(0).integers(0, 256, (height, width, 3), np.uint8)

@@ -35,7 +35,7 @@ def test_the_command_counts_every_parameter_once(tmp_path, capsys):
     assert f"{sum(saved['meta']['parameters'].values()):,}" in printed
     assert all(count > 0 for count in saved["meta"]["parameters"].values())
     (row,) = saved["rows"]
-    assert row["memory, MiB"] > row["of it intermediate"] > 0
+    assert row["memory, MiB"] > row["of that temporary"] > 0
 
 
 def test_a_missing_config_is_named(capsys):

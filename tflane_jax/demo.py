@@ -17,6 +17,7 @@ from tflane_jax.ablations.effects import Effect, effects
 from tflane_jax.ablations.results import Results
 from tflane_jax.ablations.scores import OWN_TEST
 from tflane_jax.config import EvaluationConfig, RunConfig, WorldData, load_config
+from tflane_jax.evaluation.interventions import NO_TRAFFIC
 from tflane_jax.metrics.centerline_matching import LANE_THRESHOLDS
 from tflane_jax.plots.tables import format_table
 from tflane_jax.training.loop import TrainingConfig
@@ -29,7 +30,7 @@ Lanes around a vehicle on the built-in world, preset `street`, learned twice:
   +traffic  also from the tracks of other road users, in the queries (TF-Lane's module) and in the BEV features
 The scenes are made first; then both trainings run side by side."""
 _BASELINE, _TREATMENT = "baseline", "+traffic"
-_BLIND = f"{_TREATMENT}, no traffic flow at inference"
+_BLIND = f"{_TREATMENT}, {NO_TRAFFIC}"
 _COLUMNS = {_BASELINE: _BASELINE, _TREATMENT: _TREATMENT, _BLIND: "+traffic, none at inference"}
 _DECLARED = Declaration("hidden+traffic/recall", (Claim(_TREATMENT),), "hidden-traffic/recall")
 _LANES = {

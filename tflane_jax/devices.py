@@ -66,7 +66,7 @@ def everywhere(mesh: Mesh | None) -> NamedSharding | None:
 
 
 def in_parts(mesh: Mesh) -> NamedSharding:
-    """Return the sharding of arrays of which every device has a part, along the leading axis."""
+    """Return the sharding that splits the leading axis over the devices."""
     return NamedSharding(mesh, PartitionSpec(DATA_AXIS))
 
 

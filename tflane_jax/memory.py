@@ -45,7 +45,7 @@ def give_back_freed_memory() -> None:
 
 @contextlib.contextmanager
 def huge_pages_for_children() -> Iterator[None]:
-    """Let processes that start inside ask for huge pages, of 2 MiB, where the system gives them to those that ask.
+    """Processes that start inside the block request huge pages (2 MiB), if the system grants them on request.
 
     A step writes all of its temporary memory, some 80 MiB for a small host, and with pages of 4 KiB finding them costs
     2 to 8 % of its time. glibc reads the setting when a process starts: too late for this one.

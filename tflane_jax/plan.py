@@ -27,30 +27,28 @@ GIB = 2**30
 
 
 @dataclass(frozen=True)
-class Kind:
+class Accelerator:
     """Peak numbers of an accelerator, from the maker's data sheet (dense matrices, no sparsity).
 
     Attributes:
         memory: GB (10^9 bytes).
-        bandwidth: of its memory, GB/s.
         float32, bfloat16: TFLOP/s of matrix products of such inputs; float32 as XLA computes them by default (TF32 on
             NVIDIA GPUs).
         link: GB/s to the other devices of its host, in one direction.
     """
 
     memory: float
-    bandwidth: float
     float32: float
     bfloat16: float
     link: float
 
 
-KINDS = {
-    "a100": Kind(80, 2039, 156, 312, 300),
-    "h100": Kind(80, 3350, 494, 989, 450),
-    "h200": Kind(141, 4800, 494, 989, 450),
-    "rtx3090": Kind(24, 936, 35.6, 71, 32),
-    "rtx4090": Kind(24, 1008, 82.6, 165, 32),
+ACCELERATORS = {
+    "a100": Accelerator(80, 156, 312, 300),
+    "h100": Accelerator(80, 494, 989, 450),
+    "h200": Accelerator(141, 494, 989, 450),
+    "rtx3090": Accelerator(24, 35.6, 71, 32),
+    "rtx4090": Accelerator(24, 82.6, 165, 32),
 }
 """The SXM forms with 80 and 141 GB, linked by NVLink; the RTX cards are linked by PCI Express 4.0 x16."""
 
@@ -65,7 +63,6 @@ class Plan:
         memory: all parts together; None if nothing was compiled.
         learned: parameters that have a gradient, all of them.
         step_s: of an update.
-        run_s: of all updates.
     """
 
     rows: tuple[dict[str, str], ...]
@@ -73,7 +70,6 @@ class Plan:
     memory: float | None
     learned: float
     step_s: float
-    run_s: float
 
 
 def make_plan(
@@ -93,7 +89,7 @@ def make_plan(
         task, optim, training: of the run.
         example: shapes of an example.
         devices: how many devices share each batch.
-        kind: of the devices, a name in `KINDS`.
+        kind: of the devices, a name in `ACCELERATORS`.
         utilisation: assumed fraction of the peak.
         compiled: compile the step of one device for its memory; else its memory is not estimated.
 
@@ -110,7 +106,7 @@ def make_plan(
             f"training.batch_size is {training.batch_size}, which {devices} devices and {training.accumulate} parts "
             f"(training.accumulate) cannot share evenly: choose a multiple of {passes}"
         )
-    device, optim = KINDS[kind], scaled_to_batch(optim, training.batch_size)
+    device, optim = ACCELERATORS[kind], scaled_to_batch(optim, training.batch_size)
     part = training.batch_size // passes
     program = training_program(task, example, part, optim, compiled=compiled)
     frames = example if task.frames == 1 else shapes_of(example, task.frames)
@@ -118,9 +114,9 @@ def make_plan(
         partial(init_state, task, make_optimizer(optim, any_steps(optim))), jax.random.key(0), frames
     )
     learned = _gib(state.learned)
-    between = None if program.between is None else program.between / 1024
+    temporary = None if program.temporary is None else program.temporary / 1024
     # Parts add up in a further gradient.
-    activations = None if between is None else between + (learned if training.accumulate > 1 else 0.0)
+    activations = None if temporary is None else temporary + (learned if training.accumulate > 1 else 0.0)
     shared = training.shard_state and devices > 1
     holders = devices if shared else 1
     parts = {
@@ -133,7 +129,7 @@ def make_plan(
     }
     memory = None if activations is None else sum(value for value in parts.values() if value is not None)
 
-    half = _in_half(task)
+    half = _in_bfloat16(task)
     peak = device.bfloat16 if half else device.float32
     operations = program.gflop * training.accumulate
     compute = operations / (1e3 * peak * utilisation)
@@ -164,7 +160,6 @@ def make_plan(
         memory,
         learned,
         step,
-        step * training.steps,
     )
 
 
@@ -178,7 +173,7 @@ def _number(value: float | None) -> str:
     return "not compiled" if value is None else f"{value:.3g}"
 
 
-def _in_half(task: AnyTask) -> bool:
+def _in_bfloat16(task: AnyTask) -> bool:
     """Return whether all parts of a task that have a precision compute in bfloat16."""
     found: list[str] = []
 

@@ -20,7 +20,7 @@ from tflane_jax.tasks.lane_shape import LaneShapeTask
 from tflane_jax.training.rate_factors import factor_of_leaves
 from tflane_jax.training.vectors import layout_of
 
-KINDS = {Example: "lane graphs", RoadImage: "images"}
+EXAMPLE_NAMES = {Example: "lane graphs", RoadImage: "images"}
 """Kinds of examples, in words."""
 
 
@@ -58,17 +58,17 @@ def check_kind(config: RunConfig) -> None:
     taken = RoadImage if isinstance(config.task, LaneShapeTask) else Example
     if given is not taken:
         raise UserError(
-            f"this configuration's data are {KINDS[given]} (data is {type(config.data).__name__}), but its task takes "
-            f"{KINDS[taken]} (task is {type(config.task).__name__}): change either"
+            f"this configuration's data are {EXAMPLE_NAMES[given]} (data is {type(config.data).__name__}), "
+            f"but its task takes {EXAMPLE_NAMES[taken]} (task is {type(config.task).__name__}): change either"
         )
 
 
 def shapes_of_params(task: AnyTask, example: Any) -> Any:
     """Return the shapes of a task's parameters; raises what the model raises for an example that does not fit."""
-    return jax.eval_shape(task.init, jax.random.key(0), trained_on(task, example))
+    return jax.eval_shape(task.init, jax.random.key(0), training_shapes(task, example))
 
 
-def trained_on(task: AnyTask, example: Any) -> Any:
+def training_shapes(task: AnyTask, example: Any) -> Any:
     """Return the shapes of one training input: the example, or a clip of examples."""
     return example if task.frames == 1 else shapes_of(example, task.frames)
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import jax
 
-from tflane_jax.run_checks import shapes_of_params, trained_on
+from tflane_jax.run_checks import shapes_of_params, training_shapes
 from tflane_jax.scene import shapes_of
 from tflane_jax.tasks.base import AnyTask
 from tflane_jax.training.schedule import OptimConfig, make_optimizer, scaled_to_batch
@@ -32,7 +32,7 @@ class Program:
         batch: examples at a time.
         gflop: floating-point operations, 10^9 (a multiplication with its addition counts two).
         memory: peak MiB of arguments, results and intermediate results; None if not compiled.
-        between: MiB of intermediate results.
+        temporary: MiB of intermediate results.
         compile_s: duration of compilation, seconds.
     """
 
@@ -40,7 +40,7 @@ class Program:
     batch: int
     gflop: float
     memory: float | None = None
-    between: float | None = None
+    temporary: float | None = None
     compile_s: float | None = None
 
 
@@ -63,7 +63,7 @@ def training_program(
     task: AnyTask, example: Any, batch_size: int, optim: OptimConfig, *, compiled: bool = True
 ) -> Program:
     """Return the cost of an update: loss, gradient, optimiser, moving average; of clips if the task is one of clips."""
-    example, optim = trained_on(task, example), scaled_to_batch(optim, batch_size)
+    example, optim = training_shapes(task, example), scaled_to_batch(optim, batch_size)
     steps = any_steps(optim)
     optimizer, step = make_optimizer(optim, steps), make_update_step(task, optim, steps)
     state = jax.eval_shape(partial(init_state, task, optimizer), jax.random.key(0), example)
@@ -92,5 +92,5 @@ def _program(name: str, batch: int, lowered: Any, compiled: bool) -> Program:
     seconds = time.perf_counter() - began
     # Donated arguments and the results that take their place share memory.
     whole = memory.argument_size_in_bytes + memory.output_size_in_bytes - memory.alias_size_in_bytes
-    between = memory.temp_size_in_bytes
-    return Program(name, batch, gflop, (whole + between) / MIB, between / MIB, seconds)
+    temporary = memory.temp_size_in_bytes
+    return Program(name, batch, gflop, (whole + temporary) / MIB, temporary / MIB, seconds)

@@ -35,7 +35,7 @@ def training_nearness(config: RunConfig, source: Any, root: Path | None = None) 
     if drives is None or evaluated.drives is None or not evaluated.recorded:
         return None
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", MissingTracksWarning)  # nobody looks at the traffic of these frames
+        warnings.simplefilter("ignore", MissingTracksWarning)  # only positions are used
         trained = [drive for drive in drives(train) if len(drive.positions)]
     found = nearness(trained, sources.make_dataset(source)) if trained else None
     return found if found is not None and np.isfinite(found.distances).any() else None

@@ -24,7 +24,7 @@ import numpy as np
 from benchmarks.timing import command_line, machine, markdown_table, save
 from tflane_jax.config import RunConfig, load_config
 from tflane_jax.layers.precision import Precision
-from tflane_jax.plan import KINDS
+from tflane_jax.plan import ACCELERATORS
 from tflane_jax.scene import shapes_of
 from tflane_jax.training.schedule import make_optimizer
 from tflane_jax.training.state import init_states
@@ -118,7 +118,7 @@ def run(
     tiny: bool = False,
 ) -> dict[str, Any]:
     """Measure the models, print the table, and write `gpu_steps.json` and `.md` into `out`."""
-    peak = getattr(KINDS[kind], precision)
+    peak = getattr(ACCELERATORS[kind], precision)
     rows: dict[str, dict[str, Any]] = {}
     for model in models:
         config = configuration(model, precision, remat=remat, tiny=tiny)
@@ -154,7 +154,9 @@ def main() -> None:
     parser.add_argument("--batch", type=int, default=1, help="examples of an update (default 1)")
     parser.add_argument("--precision", choices=["float32", "bfloat16"], default="bfloat16")
     parser.add_argument("--remat", action="store_true", help="recompute activations for the gradient")
-    parser.add_argument("--kind", choices=KINDS, default="h100", help="whose peak is compared with (default h100)")
+    parser.add_argument(
+        "--kind", choices=ACCELERATORS, default="h100", help="whose peak is compared with (default h100)"
+    )
     parser.add_argument("--tiny", action="store_true", help="small models, for a CPU")
     o = parser.parse_args()
     run(o.out, o.models, batch_size=o.batch, precision=o.precision, remat=o.remat, kind=o.kind, tiny=o.tiny)

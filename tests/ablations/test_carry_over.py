@@ -12,7 +12,7 @@ from tests.test_cli import CONFIG as TINY
 from tests.test_cli import fakes  # noqa: F401 (a fixture that is used by itself)
 from tflane_jax.ablations import carry_over as subject
 from tflane_jax.ablations import carry_over_plan as plans
-from tflane_jax.ablations.carry_over import CLAIMS, COLUMNS, NONE, OTHER, PRIMARY, carry_over
+from tflane_jax.ablations.carry_over import CLAIMS, COLUMNS, OTHER, PRIMARY, carry_over
 from tflane_jax.ablations.carry_over_plan import ROWS, Settings
 from tflane_jax.ablations.declaration import Claim, Declaration, Declared, check, model_of_row
 from tflane_jax.ablations.jobs import Failure, Job
@@ -21,6 +21,7 @@ from tflane_jax.cli import main
 from tflane_jax.config import RealMapData, RunConfig, load_config
 from tflane_jax.datasets.real_maps import RealMapConfig
 from tflane_jax.errors import UserError
+from tflane_jax.evaluation.interventions import NO_TRAFFIC
 from tflane_jax.world.presets import CITY, REAL_LIKE
 
 pytestmark = pytest.mark.usefixtures("cheap")
@@ -114,10 +115,10 @@ def test_tables_have_every_model_with_own_without_and_with_other_traffic(folder)
     written = json.loads((folder / "out" / "carry_over.json").read_text())
     assert [row["model"] for row in written["rows"]] == [
         "generated",
-        f"generated, {NONE}",
+        f"generated, {NO_TRAFFIC}",
         f"generated, {OTHER}",
         "mixed",
-        f"mixed, {NONE}",
+        f"mixed, {NO_TRAFFIC}",
         f"mixed, {OTHER}",
         "mixed without traffic",
     ]
@@ -137,7 +138,7 @@ def test_claims_are_tested_in_pairs_of_logs(folder):
     assert [test["control"] for test in tests] == [
         "generated",
         "mixed without traffic",
-        f"mixed, {NONE}",
+        f"mixed, {NO_TRAFFIC}",
         f"mixed, {OTHER}",
     ]
     differences = [found["mixed", log] - found["generated", log] for log in ("scene-1", "scene-3")]
@@ -298,7 +299,7 @@ def test_claims_about_rows_without_a_result_are_listed_and_counted():
     ("row", "model"),
     [
         ("generated", "generated"),
-        (f"generated, {NONE}", "generated"),
+        (f"generated, {NO_TRAFFIC}", "generated"),
         ("generated, right-hand traffic", "generated, right-hand traffic"),
         (f"generated, right-hand traffic, {OTHER}", "generated, right-hand traffic"),
         (f"mixed + BEV, {OTHER}", "mixed + BEV"),

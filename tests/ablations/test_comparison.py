@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tflane_jax.ablations.comparison import Variant, compact, summarise
+from tflane_jax.ablations.comparison import compact, summarise
 from tflane_jax.ablations.statistics import holm
 
 
@@ -13,10 +13,6 @@ def scores(*values, seeds=None):
         seed: {"all/DET_l": value, "occluded/DET_l": value / 2}
         for seed, value in zip(seeds or range(len(values)), values, strict=True)
     }
-
-
-def variant(name, *values):
-    return Variant(name, tuple(scores(*values).values()))
 
 
 def test_rows():
@@ -30,10 +26,12 @@ def test_rows():
 
 
 def test_compact_is_in_percent():
-    rows = compact([variant("base", 0.1, 0.2)], ["all/DET_l", "occluded/DET_l"])
+    rows = compact({"base": scores(0.1, 0.2).values()}, ["all/DET_l", "occluded/DET_l"])
     assert rows == [{"model": "base", "all/DET_l": "15.0 ± 7.1", "occluded/DET_l": "7.5 ± 3.5"}]
-    assert compact([variant("base", 0.1)], ["all/DET_l"]) == [{"model": "base", "all/DET_l": "10.0"}]
-    assert compact([variant("base", 0.1, float("nan"))], ["all/DET_l"]) == [{"model": "base", "all/DET_l": "n/a"}]
+    assert compact({"base": scores(0.1).values()}, ["all/DET_l"]) == [{"model": "base", "all/DET_l": "10.0"}]
+    assert compact({"base": scores(0.1, float("nan")).values()}, ["all/DET_l"]) == [
+        {"model": "base", "all/DET_l": "n/a"}
+    ]
 
 
 def test_a_variant_is_paired_over_the_seeds_that_the_control_has():

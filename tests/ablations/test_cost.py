@@ -37,6 +37,7 @@ def test_runs_that_tables_share_cost_once():
     assert core_minutes([table.lengthened(4)]) == 4 * core_minutes([table])
 
 
+@pytest.mark.slow
 def test_the_cost_of_all_tables_is_that_of_the_runs_that_a_store_would_hold():
     costs = {}
     for table in TABLES.values():

@@ -77,6 +77,24 @@ def test_a_failed_training_stops_no_other_and_is_listed(tiny, tmp_path, monkeypa
     assert "two-sided t-test over 4 seeds" in (out / "paired.md").read_text()
 
 
+def test_a_run_that_cannot_be_evaluated_stops_no_table(tiny, tmp_path, monkeypatch, capsys):
+    """Regression: the picture opened the damaged run of the first seed again, before any table was written."""
+    train_run = workers.train_run
+
+    def train_and_damage(config, folder, **options):
+        result = train_run(config, folder, **options)
+        if folder.as_posix().endswith("base/seed_0"):
+            for manifest in folder.glob("checkpoints/*/manifest.json"):
+                manifest.write_text("{")
+        return result
+
+    monkeypatch.setattr(workers, "train_run", train_and_damage)
+    assert compare(tiny, tmp_path, "01") == 2
+    assert "1 of 4 trainings failed" in capsys.readouterr().err
+    last = [row for row in rows(tmp_path / "table.md") if row["checkpoint"] == "last"]
+    assert [(row["model"], row["seeds"]) for row in last][:2] == [("base", "1"), ("tfm", "0, 1")]
+
+
 def test_all_rows_are_checked_before_the_first_is_trained(tiny, tmp_path, monkeypatch, capsys):
     trained, out = failing(monkeypatch), tmp_path / "out"
     rows = [

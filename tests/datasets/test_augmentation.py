@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.shared import assert_same
 from tflane_jax.datasets import augmentation
 from tflane_jax.datasets.augmentation import (
     GREY,
@@ -29,10 +30,6 @@ GEOMETRY = replace(NO_AUGMENTATION, geometry=1.0)
 FLIP = replace(GEOMETRY, rotation=0.0, flip=1.0, crop=1.0)
 COLOUR = replace(ALWAYS, geometry=0.0)
 WARPS = AugmentationConfig(geometry=1.0, brightness=0.0, contrast=0.0, saturation=0.0, lighting=0.0)
-
-
-def assert_same(a, b):
-    jax.tree.map(np.testing.assert_array_equal, a, b)
 
 
 def example(seed=0, lines=4, height=HEIGHT, width=WIDTH):

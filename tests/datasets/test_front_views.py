@@ -7,6 +7,7 @@ import jax
 import numpy as np
 import pytest
 
+from tests.shared import assert_same
 from tflane_jax.datasets import cache, sources
 from tflane_jax.datasets.front_views import FrontViewConfig, FrontViewDataset, load_road_images
 from tflane_jax.datasets.leaves import IMAGE_PARTS, example_leaves, image_from_leaves
@@ -20,10 +21,6 @@ SMALL = FrontViewConfig(split="val", images=3, first=5)
 @pytest.fixture(autouse=True)
 def own_cache(tmp_path, monkeypatch):
     monkeypatch.setenv("TFLANE_CACHE", str(tmp_path))
-
-
-def assert_same(a, b):
-    jax.tree.map(np.testing.assert_array_equal, a, b)
 
 
 def test_splits_own_disjoint_ranges_of_ids():

@@ -5,14 +5,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.shared import shared_path
+from tests.shared import random_photo, shared_path
 from tflane_jax.datasets.photos import FOCAL, HEIGHT, HORIZON, WIDTH, PhotoCamera, Placement, fit_photo
 from tflane_jax.errors import UserError
 from tflane_jax.files.images import read_image, resize
-
-
-def photo(height, width):
-    return np.random.default_rng(0).integers(0, 256, (height, width, 3), np.uint8)
 
 
 @pytest.mark.golden
@@ -29,7 +25,7 @@ def test_a_tusimple_frame_is_read_and_fitted_as_by_the_reference():
 
 @pytest.mark.parametrize(("height", "width"), [(1, 1), (3, 1000), (590, 1640), (720, 1280), (900, 1200), (1200, 900)])
 def test_a_photo_of_any_size_is_seen_whole(height, width):
-    fitted = fit_photo(photo(height, width))
+    fitted = fit_photo(random_photo(height, width))
     assert fitted.placement == Placement(0, 0, width, height)
     assert fitted.image.shape == (HEIGHT, WIDTH, 3)
     assert fitted.image.dtype == np.uint8
@@ -41,26 +37,27 @@ def test_a_photo_of_any_size_is_seen_whole(height, width):
 def test_tusimples_own_camera_is_seen_whole(scale):
     height, width = round(720 * scale), round(1280 * scale)
     camera = PhotoCamera(FOCAL * width, HORIZON * height)
-    assert fit_photo(photo(height, width), camera).placement == Placement(0, 0, width, height)
+    assert fit_photo(random_photo(height, width), camera).placement == Placement(0, 0, width, height)
 
 
 def test_a_horizon_cuts_the_sky():
-    seen = fit_photo(photo(600, 800), PhotoCamera(horizon=300)).placement
+    seen = fit_photo(random_photo(600, 800), PhotoCamera(horizon=300)).placement
     assert (seen.left, seen.width, seen.top + seen.height) == (0, 800, 600)
     assert seen.to_network(np.array([0.0, 300.0]))[1] == pytest.approx(HORIZON, abs=2e-3)
     # Nothing can be added above a horizon that is higher than TuSimple's.
-    assert fit_photo(photo(600, 800), PhotoCamera(horizon=50)).placement == Placement(0, 0, 800, 600)
+    assert fit_photo(random_photo(600, 800), PhotoCamera(horizon=50)).placement == Placement(0, 0, 800, 600)
 
 
 def test_a_wide_lens_is_cut_to_tusimples_view():
     """Half the focal length: half of each side, and the same angles of the scene in the same places."""
     camera = PhotoCamera(focal=FOCAL * 640, horizon=400, column=700)
-    seen = fit_photo(photo(800, 1280), camera).placement
+    seen = fit_photo(random_photo(800, 1280), camera).placement
     assert (seen.width, seen.left) == (640, 380)
     assert abs(seen.height - 360) <= 1
     np.testing.assert_allclose(seen.to_network(np.array([700.0, 400.0])), [0.5, HORIZON], atol=2e-3)
     # Ahead near the border: the view keeps its width.
-    assert fit_photo(photo(800, 1280), PhotoCamera(FOCAL * 640, column=1270)).placement == Placement(640, 0, 640, 800)
+    near_border = PhotoCamera(FOCAL * 640, column=1270)
+    assert fit_photo(random_photo(800, 1280), near_border).placement == Placement(640, 0, 640, 800)
 
 
 def test_thin_paint_survives_a_strong_reduction():

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from tests.evaluation.test_found_lanes import frame
 from tflane_jax.evaluation.found_lanes import best_threshold, lane_confidences
-from tflane_jax.evaluation.lane_errors import FATES, Frame, count_errors, covered_fraction, frame_of, lane_errors
+from tflane_jax.evaluation.lane_errors import OUTCOMES, Frame, count_errors, covered_fraction, frame_of, lane_errors
 from tflane_jax.metrics.centerline_matching import nearest_lanes
 from tflane_jax.scene import CenterlinePrediction, LaneGraph, Prediction, SegmentPrediction
 
@@ -29,7 +29,7 @@ def scene(truth, detected, scores):
 
 
 def numbers(counts):
-    return [counts[fate] for fate in FATES]
+    return [counts[outcome] for outcome in OUTCOMES]
 
 
 def test_a_lane_that_is_cut_elsewhere_is_seen_and_not_found():
@@ -42,12 +42,12 @@ def test_a_lane_that_is_cut_elsewhere_is_seen_and_not_found():
 
 
 @pytest.mark.parametrize(
-    ("end", "fate"), [(38.0, "other ends"), (30.0, "in part"), (21.0, "in part"), (12.0, "missed")]
+    ("end", "outcome"), [(38.0, "wrong extent"), (30.0, "in part"), (21.0, "in part"), (12.0, "missed")]
 )
-def test_the_covered_length_decides(end, fate):
+def test_the_covered_length_decides(end, outcome):
     """Detections reach WITHIN farther than they go."""
     frames = [scene([line(0, 40)], [line(-10, end)], [0.9]), scene([line(0, 20)], [line(0, 20)], [0.5])]
-    assert count_errors(frames).lanes == dict.fromkeys(FATES, 0) | {"found": 1, fate: 1}
+    assert count_errors(frames).lanes == dict.fromkeys(OUTCOMES, 0) | {"found": 1, outcome: 1}
 
 
 def test_a_second_detection_of_a_lane_finds_it_again_whatever_the_order():
@@ -81,13 +81,13 @@ def test_lines_without_length_and_empty_frames():
 
 @settings(max_examples=30)
 @given(seed=st.integers(0, 10**6), turn=st.floats(-3.0, 3.0), shift=st.floats(-30.0, 30.0))
-def test_every_line_has_one_fate_in_any_frame_of_reference(seed, turn, shift):
+def test_every_line_has_one_outcome_in_any_frame_of_reference(seed, turn, shift):
     truth, detected, scores = frame(seed)
     errors = count_errors([Frame(truth, detected, scores, *nearest_lanes(truth, detected))])
     assert sum(errors.lanes.values()) == len(truth)
     assert sum(errors.detections.values()) == (scores >= errors.threshold).sum()
     assert errors.lanes["found"] == errors.detections["found"]
-    assert errors.lanes["again"] == 0
+    assert errors.lanes["duplicate"] == 0
     confidences = lane_confidences(truth, detected, scores)
     assert errors.threshold == best_threshold([confidences], [scores])
     assert errors.lanes["found"] == (confidences >= errors.threshold).sum()

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from tests.golden import case_id, golden_modules, load_module_case
+from tests.shared import random_photo
 from tflane_jax.errors import LeftOutWarning, UserError
 from tflane_jax.files.images import list_photos, read_image, resize
 
@@ -18,10 +19,6 @@ RED = np.full((6, 8, 3), (0, 0, 255), np.uint8)  # BGR
 def written(path: Path, image: np.ndarray, suffix: str = ".png") -> Path:
     path.write_bytes(cv2.imencode(suffix, image)[1].tobytes())
     return path
-
-
-def photo(height, width):
-    return np.random.default_rng(0).integers(0, 256, (height, width, 3), np.uint8)
 
 
 @pytest.mark.golden
@@ -76,7 +73,7 @@ def test_photos_stand_upright(tmp_path):
 def test_unreadable_files_are_named(tmp_path):
     (tmp_path / "empty.jpg").touch()
     (tmp_path / "text.jpg").write_text("hello")
-    whole = written(tmp_path / "whole.jpg", photo(64, 64), ".jpg").read_bytes()
+    whole = written(tmp_path / "whole.jpg", random_photo(64, 64), ".jpg").read_bytes()
     (tmp_path / "cut.jpg").write_bytes(whole[: len(whole) // 2])
     for name, message in {
         "missing.jpg": "cannot read .*missing.jpg: No such file",

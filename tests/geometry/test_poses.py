@@ -15,6 +15,7 @@ from tflane_jax.geometry import (
     pose_yaw,
     relative_pose,
     transform_points,
+    wrap_angle,
     yaw_pose,
 )
 
@@ -94,3 +95,11 @@ def test_one_pose_moves_points_of_any_rank_on_host_and_device():
         on_device = jax.jit(transform_points)(jnp.asarray(pose), jnp.asarray(points))
     np.testing.assert_allclose(on_device, moved, atol=1e-5)
     assert transform_points(pose, np.zeros((0, 3))).shape == (0, 3)
+
+
+@pytest.mark.parametrize("turns", [-2, 0, 1, 5])
+@pytest.mark.parametrize("angle", [-3.1, -1.0, 0.0, 2.5])
+def test_wrapped_angles_are_those_less_than_a_turn_that_point_the_same_way(angle, turns):
+    assert float(wrap_angle(angle + 2 * np.pi * turns)) == pytest.approx(angle, abs=1e-12)
+    np.testing.assert_allclose(wrap_angle(np.full((2, 3), angle)), angle)
+    assert float(wrap_angle(np.pi)) == -np.pi

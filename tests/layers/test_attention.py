@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from jax.test_util import check_grads
 
+from tests.shared import random_mask
 from tflane_jax.layers import attention
 from tflane_jax.layers.attention import MultiHeadAttention, attention_probabilities, masked_attention
 from tflane_jax.layers.masks import key_mask, pair_mask
@@ -31,10 +32,6 @@ def arrays(seed, queries, keys, heads=HEADS):
     rng = np.random.default_rng(seed)
     shapes = ((heads, queries, D), (heads, keys, D), (heads, keys, E), (heads, queries, E))
     return tuple(jnp.asarray(rng.normal(size=shape).astype(np.float32)) for shape in shapes)
-
-
-def random_mask(seed, *shape):
-    return jnp.asarray(np.random.default_rng(seed).random(shape) < 0.5)
 
 
 def with_gradients(query, key, value, gradient, mask):

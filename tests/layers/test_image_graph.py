@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from jax.test_util import check_grads
 
+from tests.shared import random_array
 from tflane_jax.layers.image_graph import SIDES, Relation, attend_along, attend_near, mix_relations, smooth
 
 RELATIONS = get_args(Relation)
@@ -20,10 +21,6 @@ SHAPE = (3, 4)
 
 def random_valid(seed, shape=SHAPE):
     return np.random.default_rng(seed).random(shape) < 0.7
-
-
-def random_array(seed, *shape):
-    return jnp.asarray(np.random.default_rng(seed).normal(size=shape).astype(np.float32))
 
 
 def senders(relation, i, j, valid):

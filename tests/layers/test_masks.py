@@ -8,6 +8,7 @@ import shapely
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.shared import random_mask
 from tflane_jax.layers.masks import (
     SpatialMask,
     causal_mask,
@@ -20,13 +21,9 @@ from tflane_jax.layers.masks import (
 )
 
 
-def random_bool(seed, *shape):
-    return jnp.asarray(np.random.default_rng(seed).random(shape) < 0.5)
-
-
 @pytest.mark.parametrize(("queries", "keys"), [(3, 4), (1, 1), (0, 2), (2, 0)])
 def test_pairs(queries, keys):
-    valid_queries, valid_keys = random_bool(0, queries), random_bool(1, keys)
+    valid_queries, valid_keys = random_mask(0, queries), random_mask(1, keys)
     by_key = np.broadcast_to(key_mask(valid_keys), (queries, keys))
     by_pair = np.asarray(pair_mask(valid_queries, valid_keys))
     assert by_pair.shape == (queries, keys)
@@ -40,8 +37,8 @@ def test_pairs(queries, keys):
 @pytest.mark.parametrize("host", ["no mask", "own mask"])
 def test_spatial_mask_entry_by_entry(lanes, traffic, host):
     """Lanes attend to the lanes of the host's mask and to valid instances; valid instances to lanes and each other."""
-    valid = random_bool(2, traffic)
-    lane_mask = random_bool(3, lanes, lanes) if host == "own mask" else None
+    valid = random_mask(2, traffic)
+    lane_mask = random_mask(3, lanes, lanes) if host == "own mask" else None
     dense = np.asarray(SpatialMask.from_validity(lanes, valid, lane_mask).dense())
     assert dense.shape == (lanes + traffic, lanes + traffic)
     for i in range(lanes + traffic):
@@ -54,21 +51,21 @@ def test_spatial_mask_entry_by_entry(lanes, traffic, host):
 
 
 def test_spatial_mask_works_under_vmap_and_takes_custom_quadrants():
-    valid = random_bool(4, 5, 3)
+    valid = random_mask(4, 5, 3)
     batch = jax.vmap(lambda v: SpatialMask.from_validity(2, v))(valid)
     assert batch.lane_lane is None
     dense = jax.vmap(SpatialMask.dense)(batch)
     for i in range(5):
         np.testing.assert_array_equal(dense[i], SpatialMask.from_validity(2, valid[i]).dense())
 
-    near = random_bool(5, 2, 3)
+    near = random_mask(5, 2, 3)
     swapped = SpatialMask.from_validity(2, valid[0]).replace(lane_traffic=near)
     np.testing.assert_array_equal(swapped.dense()[:2, 2:], near)
 
 
 def test_unused_quadrants_are_not_built():
     """4,000 x 4,000 lanes without a mask of the host's own must not cost 16 MB."""
-    mask = SpatialMask.from_validity(4000, random_bool(6, 30))
+    mask = SpatialMask.from_validity(4000, random_mask(6, 30))
     assert sum(leaf.size for leaf in jax.tree.leaves(mask)) <= 30 * 30 + 3 * 30  # quadrants, and the validity itself
 
 
@@ -145,8 +142,8 @@ def test_nearest_keys_first_ones_of_equal_distance(count):
 
 @pytest.mark.parametrize("heads", [(), (2,)])
 def test_restrictions_are_composed_entry_by_entry(heads):
-    valid, one, other = random_bool(7, 3), random_bool(8, *heads, 4, 3), random_bool(9, 4, 3)
-    lane_mask = random_bool(10, 4, 4)
+    valid, one, other = random_mask(7, 3), random_mask(8, *heads, 4, 3), random_mask(9, 4, 3)
+    lane_mask = random_mask(10, 4, 4)
     mask = SpatialMask.from_validity(4, valid, lane_mask).restricted(one).restricted(other)
     dense, free = np.asarray(mask.dense()), np.asarray(SpatialMask.from_validity(4, valid, lane_mask).dense())
     assert dense.shape == (*heads, 7, 7)
@@ -160,7 +157,7 @@ def test_restrictions_are_composed_entry_by_entry(heads):
 
 def test_each_group_of_lanes_has_its_copy_of_the_instances():
     """Entry by entry: within a group as without groups, between groups nothing."""
-    valid, pairs = random_bool(0, 3), random_bool(1, 2, 5, 3)
+    valid, pairs = random_mask(0, 3), random_mask(1, 2, 5, 3)
     whole = SpatialMask.from_validity(
         5, jnp.asarray(valid), jnp.asarray(np.arange(5)[:, None] // 2 == np.arange(5) // 2)
     )

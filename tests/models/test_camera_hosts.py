@@ -12,6 +12,7 @@ from jax import lax
 
 from tests.models.cases import CAMERA_DETR, CAMERA_TOPONET, make_camera_example, make_example
 from tests.parameters import random_params
+from tests.shared import assert_same
 from tflane_jax.config import RunConfig, WorldData
 from tflane_jax.datasets.base import ExampleConfig
 from tflane_jax.errors import UserError
@@ -63,10 +64,6 @@ def toponet():
     return fit("toponet")
 
 
-def same(a, b):
-    jax.tree.map(np.testing.assert_array_equal, a, b)
-
-
 def batch_of(*examples):
     return jax.tree.map(jnp.asarray, stack_examples(list(examples)))
 
@@ -101,14 +98,14 @@ def soiled(example):
 
 
 def test_padding_content_changes_no_output(fitted):
-    same(fitted.predict(make_camera_example(2)), fitted.predict(soiled(make_camera_example(2))))
+    assert_same(fitted.predict(make_camera_example(2)), fitted.predict(soiled(make_camera_example(2))))
 
 
 @pytest.mark.slow
 def test_padding_content_changes_no_gradient(toponet):
     key, clean, dirty = jax.random.key(0), make_camera_example(2), soiled(make_camera_example(2))
     results = [toponet.train(toponet.params, batch_of(e, make_camera_example(3)), key) for e in (clean, dirty)]
-    same(*results)
+    assert_same(*results)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(results[0]))
 
 
@@ -121,7 +118,7 @@ def test_an_invalid_camera_changes_nothing(fitted):
         silent = example.replace(cameras=example.cameras.replace(valid=valid))
         broken = example.replace(cameras=example.cameras.replace(valid=valid, intrinsics=intrinsics, image=image))
         answer = fitted.predict(silent)
-        same(answer, fitted.predict(broken))
+        assert_same(answer, fitted.predict(broken))
         assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(answer))
 
 
@@ -197,9 +194,9 @@ def test_a_stream_equals_the_scan_over_its_sequence(toponet):
         answers.append(answer)
     scan = jax.jit(lambda p, m, f: lax.scan(functools.partial(task.step, p), m, f))
     scanned = scan(params, task.start(), batch_of(*frames))
-    same(scanned, (memory, jax.tree.map(lambda *leaves: jnp.stack(leaves), *answers)))
+    assert_same(scanned, (memory, jax.tree.map(lambda *leaves: jnp.stack(leaves), *answers)))
     # The third frame begins a scene, so it forgets; the fourth remembers.
-    same(answers[2], toponet.predict(frames[2]))
+    assert_same(answers[2], toponet.predict(frames[2]))
     assert not np.array_equal(answers[3].centerlines.points, toponet.predict(frames[3]).centerlines.points)
 
 
@@ -210,7 +207,7 @@ def test_an_empty_scene_equals_no_traffic_flow(toponet):
     assert not np.array_equal(answer.centerlines.points, toponet.predict(example).centerlines.points)
     # Parameters of the temporal encoder have no effect.
     other = {**toponet.params, "temporal_encoder": jax.tree.map(lambda x: x + 1.0, toponet.params["temporal_encoder"])}
-    same(answer, toponet.step(other, toponet.task.start(), absent)[1])
+    assert_same(answer, toponet.step(other, toponet.task.start(), absent)[1])
 
 
 def test_mismatched_parts_are_errors():

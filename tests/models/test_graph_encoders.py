@@ -11,6 +11,7 @@ import pytest
 from tests.layers.published_gtn import GTN_2022, meta_path_graphs
 from tests.layers.test_image_graph import dense_stack
 from tests.parameters import random_params
+from tests.shared import random_array
 from tests.slow import with_slow
 from tflane_jax.errors import UserError
 from tflane_jax.layers.attention import MultiHeadAttention
@@ -40,10 +41,6 @@ QUICK = ("gtn every hop", "gtn similarity alone", "gcn", "han meta-paths")
 PARAMETERS = {"gtn": 23_360, "gcn": 19_072, "han": 22_016}
 
 every_config = pytest.mark.parametrize("name", with_slow(CONFIGS, QUICK))
-
-
-def random_array(seed, *shape):
-    return jnp.asarray(np.random.default_rng(seed).normal(size=shape).astype(np.float32))
 
 
 def scene(seed=0, shape=SHAPE):

@@ -18,6 +18,7 @@ from tests.models.cases import (
     make_line_example,
 )
 from tests.parameters import random_params
+from tests.shared import assert_same
 from tests.slow import with_slow
 from tflane_jax.errors import UserError
 from tflane_jax.losses.lanesegnet import LaneSegNetLossConfig
@@ -79,10 +80,6 @@ def fit(name):
     return task, params, jax.jit(partial(predicted, task))
 
 
-def same(a, b):
-    jax.tree.map(np.testing.assert_array_equal, a, b)
-
-
 @pytest.mark.parametrize("name", with_slow(MODELS, QUICK))
 def test_shapes_and_range(name):
     _, params, predict = fit(name)
@@ -108,7 +105,7 @@ def test_padding_may_hold_nan(name):
         size=np.where(flow.valid.any(-1)[:, None], flow.size, np.nan),
         category=np.where(flow.valid.any(-1), flow.category, 10**6).astype(np.int32),
     )
-    same(predict(params, example), predict(params, example.replace(traffic_flow=dirty)))
+    assert_same(predict(params, example), predict(params, example.replace(traffic_flow=dirty)))
 
 
 @pytest.mark.parametrize("name", with_slow(WITH_PRIOR, QUICK))
@@ -116,17 +113,17 @@ def test_an_empty_scene_equals_no_traffic_flow(name):
     _, params, predict = fit(name)
     example = make_line_example(4)
     absent = predict(params, example.replace(traffic_flow=None))
-    same(absent, predict(params, example.replace(traffic_flow=TrafficFlow.empty(16, 20))))
+    assert_same(absent, predict(params, example.replace(traffic_flow=TrafficFlow.empty(16, 20))))
     # The parameters of the temporal encoder must have no effect in an empty scene.
     other = {**params, "temporal_encoder": jax.tree.map(lambda x: x + 1.0, params["temporal_encoder"])}
-    same(absent, predict(other, example.replace(traffic_flow=None)))
+    assert_same(absent, predict(other, example.replace(traffic_flow=None)))
     assert not np.array_equal(absent.points, predict(params, example).points)
 
 
 @pytest.mark.parametrize("name", ["baseline", "segments", "lines"])
 def test_baseline_does_not_depend_on_traffic(name):
     _, params, predict = fit(name)
-    same(predict(params, make_line_example(5)), predict(params, make_line_example(5).replace(traffic_flow=None)))
+    assert_same(predict(params, make_line_example(5)), predict(params, make_line_example(5).replace(traffic_flow=None)))
 
 
 @pytest.mark.parametrize("name", with_slow(WITH_PRIOR, QUICK))
@@ -135,7 +132,7 @@ def test_lanes_do_not_depend_on_the_order_of_instances(name):
     example = make_line_example(6)
     order = np.random.default_rng(0).permutation(16)
     shuffled = example.replace(traffic_flow=jax.tree.map(lambda x: x[order], example.traffic_flow))
-    same(predict(params, example), predict(params, shuffled))
+    assert_same(predict(params, example), predict(params, shuffled))
 
 
 @pytest.mark.parametrize("name", with_slow(MODELS, QUICK))

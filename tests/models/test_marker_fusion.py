@@ -11,6 +11,7 @@ from jax import lax
 
 from tests.models.cases import BASELINE, CAMERA_TOPONET, WITH_TRAFFIC, make_camera_example, make_example
 from tests.parameters import random_params
+from tests.shared import assert_same
 from tflane_jax.layers.masks import key_mask
 from tflane_jax.layers.polyline_encoder import PolylineEncoderConfig
 from tflane_jax.models.marker_fusion import (
@@ -79,10 +80,6 @@ def step():
     return jax.jit(HOST.step)
 
 
-def same(a, b):
-    jax.tree.map(np.testing.assert_array_equal, a, b)
-
-
 def without_markers(params):
     """Return the parameters without those of marker fusion."""
     if not isinstance(params, dict):
@@ -93,8 +90,8 @@ def without_markers(params):
 def test_without_markers_in_sight_the_host_is_unchanged(params, step):
     expected = jax.jit(PLAIN.step)(without_markers(params), PLAIN.start(), make_example(0))[1]
     for markers in (None, observed(valid=False), observed(valid=False, garbage=np.nan), observed(lanes=0)):
-        same(step(params, HOST.start(), seeing(markers, has_previous=np.asarray(False)))[1], expected)
-        same(jax.jit(HOST.predict)(params, seeing(markers)), expected)
+        assert_same(step(params, HOST.start(), seeing(markers, has_previous=np.asarray(False)))[1], expected)
+        assert_same(jax.jit(HOST.predict)(params, seeing(markers)), expected)
     guided = step(params, HOST.start(), seeing(observed()))[1]
     assert not np.array_equal(guided.centerlines.points, expected.centerlines.points)
 
@@ -107,7 +104,7 @@ def test_cameras_may_have_markers_too():
     params = random_params(host.init, example)
     expected = jax.jit(plain.predict)(without_markers(params), example)
     predict = jax.jit(host.predict)
-    same(predict(params, example.replace(markers=observed(valid=False, garbage=np.nan))), expected)
+    assert_same(predict(params, example.replace(markers=observed(valid=False, garbage=np.nan))), expected)
     guided = predict(params, example.replace(markers=observed()))
     assert not np.array_equal(guided.centerlines.points, expected.centerlines.points)
     assert np.isfinite(guided.centerlines.points).all()
@@ -143,11 +140,11 @@ def test_traffic_flow_markers_and_sd_map_work_in_one_model():
 
 def test_padding_may_hold_nan(params, step):
     clean, dirty = (seeing(observed(garbage=value)) for value in (0.0, np.nan))
-    same(step(params, HOST.start(), clean), step(params, HOST.start(), dirty))
+    assert_same(step(params, HOST.start(), clean), step(params, HOST.start(), dirty))
     gradient = jax.jit(jax.grad(lambda p, e: HOST.loss(p, e, jax.random.key(0))[0]))
     batches = [jax.tree.map(jnp.asarray, stack_examples([example])) for example in (clean, dirty)]
     first, second = (gradient(params, batch) for batch in batches)
-    same(first, second)
+    assert_same(first, second)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(first))
     assert np.abs(first["marker_tokens"]["lines"]["embed"]["kernel"]).max() > 0
 
@@ -171,8 +168,8 @@ def test_stream_equals_scan_and_visibility_causes_no_retrace(params):
             answers.append(answer)
         scan = jax.jit(lambda frames: lax.scan(partial(HOST.step, params), HOST.start(), frames))
         last, scanned = scan(jax.tree.map(jnp.asarray, stack_examples(frames)))
-        same(last, memory)
-        same(scanned, jax.tree.map(lambda *leaves: np.stack(leaves), *answers))
+        assert_same(last, memory)
+        assert_same(scanned, jax.tree.map(lambda *leaves: np.stack(leaves), *answers))
     assert len(traces) == 1
 
 
@@ -218,9 +215,9 @@ def test_the_gate_is_the_confidence_and_its_variants():
     np.testing.assert_allclose(out, normed * norm["scale"] + norm["bias"], atol=1e-4)
 
     uniform, hard = (replace(CONFIG, fusion=kind) for kind in ("uniform", "hard"))
-    same(fused(uniform, near, bev, position)[0], fused(uniform, far, bev, position)[0])
-    same(fused(hard, near, bev, position)[0], fused(uniform, near, bev, position)[0])
-    same(fused(hard, far, bev, position)[0], bev)
+    assert_same(fused(uniform, near, bev, position)[0], fused(uniform, far, bev, position)[0])
+    assert_same(fused(hard, near, bev, position)[0], fused(uniform, near, bev, position)[0])
+    assert_same(fused(hard, far, bev, position)[0], bev)
     assert not np.array_equal(out, fused(CONFIG, far, bev, position)[0])
 
 
@@ -254,12 +251,12 @@ def test_as_written_the_norm_applies_without_markers_too():
     bev, position = (jnp.asarray(rng.normal(size=(5, 8)), jnp.float32) for _ in range(2))
     near = lanes_of(seeing(observed(10.0)))
     nothing = near.replace(valid=jnp.zeros_like(near.valid), gate=jnp.zeros(()))
-    same(fused(config, near, bev, position)[0], fused(config, near, bev, position + 1.0)[0])
+    assert_same(fused(config, near, bev, position)[0], fused(config, near, bev, position + 1.0)[0])
     out, variables, _ = fused(config, nothing, bev, position)
     norm = jax.tree.map(np.asarray, variables["params"]["norm"])
     expected = np.asarray(bev - bev.mean(-1, keepdims=True)) / np.sqrt(np.asarray(bev.var(-1))[:, None] + 1e-5)
     np.testing.assert_allclose(out, expected * norm["scale"] + norm["bias"], atol=1e-4)
-    same(fused(replace(config, norm="sum"), nothing, bev, position)[0], bev)
+    assert_same(fused(replace(config, norm="sum"), nothing, bev, position)[0], bev)
 
 
 def test_uniform_fusion_knows_no_confidence():
@@ -286,7 +283,7 @@ def test_a_zero_initialised_fusion_leaves_the_trained_host_unchanged():
     module = MarkerFusion(replace(CONFIG, norm="query", width=16))
     bev, position, tokens = (jnp.asarray(np.random.default_rng(i).normal(size=(5, 8)), jnp.float32) for i in range(3))
     arguments = bev, position, tokens, jnp.ones((1, 5), bool)
-    same(module.apply(module.init(jax.random.key(0), *arguments, 0.7), *arguments, 0.7), bev)
+    assert_same(module.apply(module.init(jax.random.key(0), *arguments, 0.7), *arguments, 0.7), bev)
     learned = random_params(lambda key: module.init(key, *arguments, 0.7))
     change, half = (module.apply(learned, *arguments, gate) - bev for gate in (0.7, 0.35))
     assert np.abs(change).max() > 1e-3
@@ -301,7 +298,7 @@ def test_cells_beyond_the_radius_of_all_lanes_are_unchanged():
     tokens = jnp.asarray(np.random.default_rng(1).normal(size=(len(guide.valid), 8)), jnp.float32)
     arguments, module = (jnp.ones((2, 8)), jnp.zeros((2, 8)), tokens, mask, guide.gate), MarkerFusion(config)
     out = module.apply(random_params(lambda key: module.init(key, *arguments)), *arguments)
-    same(out[1], jnp.ones(8))
+    assert_same(out[1], jnp.ones(8))
     assert not np.array_equal(out[0], jnp.ones(8))
 
 

@@ -20,6 +20,7 @@ from tests.models.cases import (
 )
 from tests.models.toy_prior import CrossingsConfig, with_crossings
 from tests.parameters import random_params
+from tests.shared import assert_same
 from tests.slow import with_slow
 from tflane_jax.models.bevformer_detr import BevFormerDetrConfig
 from tflane_jax.models.prior import HostQueries, HostSpec
@@ -53,10 +54,6 @@ HOSTS = {
 }
 
 
-def same(a, b):
-    jax.tree.map(np.testing.assert_array_equal, a, b)
-
-
 @pytest.mark.parametrize("name", with_slow(HOSTS, quick=("toponet", "detr")))
 def test_a_new_prior_plugs_into_every_host_by_both_hooks(name):
     host, make = HOSTS[name]
@@ -68,9 +65,9 @@ def test_a_new_prior_plugs_into_every_host_by_both_hooks(name):
     assert "crossings_0" in str(jax.tree.structure(params["encoder"]))
     predict = jax.jit(task.predict)
     absent = predict(params, with_crossings(example, 0))
-    same(absent, predict(params, with_crossings(example, 0, filler=np.nan)))
+    assert_same(absent, predict(params, with_crossings(example, 0, filler=np.nan)))
     one, two = (predict(params, with_crossings(example, count)) for count in (1, 2))
-    same(one, predict(params, with_crossings(example, 1, filler=np.nan)))
+    assert_same(one, predict(params, with_crossings(example, 1, filler=np.nan)))
     for a, b in ((absent, one), (one, two)):
         assert not np.array_equal(jax.tree.leaves(a)[0], jax.tree.leaves(b)[0])  # points
 
@@ -79,7 +76,7 @@ def test_a_new_prior_plugs_into_every_host_by_both_hooks(name):
     shapes = jax.eval_shape(plain.init, jax.random.key(0), example)
     rest = jax.tree_util.tree_map_with_path(lambda path, _: _at(params, path), shapes)
     without = jax.jit(plain.predict)(rest, example)
-    same(without, absent)
+    assert_same(without, absent)
 
 
 def _at(tree, path):
@@ -111,7 +108,7 @@ def test_memories_go_from_frame_to_frame_of_a_clip_and_of_a_stream():
     memories = task.start().priors
     for i, frame in enumerate(frames):
         found, memories = observe(task.model.build_priors(), frame, memories)
-        same(found["crossings"], jax.tree.map(lambda leaf, i=i: leaf[i], together["crossings"]))
+        assert_same(found["crossings"], jax.tree.map(lambda leaf, i=i: leaf[i], together["crossings"]))
     params = random_params(task.init, clip, spread=0.2)
     _, answers = jax.jit(lambda p, c: lax.scan(lambda m, e: task.step(p, m, e), task.start(), c))(params, clip)
     alone = jax.jit(task.predict)(params, frames[2])

@@ -16,6 +16,7 @@ from tests.models.cases import (
     make_example,
 )
 from tests.parameters import random_params
+from tests.shared import assert_same
 from tflane_jax.errors import UserError
 from tflane_jax.models.priors import PriorsConfig, bev_hook
 from tflane_jax.models.traffic_flow_module import TrafficFlowConfig
@@ -35,10 +36,6 @@ def with_flow(host, flow):
 
 def without_flow(example):
     return example.replace(traffic_flow=TrafficFlow.empty(16, 20))
-
-
-def same(a, b):
-    jax.tree.map(np.testing.assert_array_equal, a, b)
 
 
 def restricted(params, shapes):
@@ -64,11 +61,11 @@ def test_absent_traffic_gives_the_host_without_the_prior(host, make):
     assert not np.array_equal(*points)
     flow = example.traffic_flow
     garbage = flow.replace(position=np.full_like(flow.position, np.nan), valid=np.zeros_like(flow.valid))
-    same(absent, predict(params, example.replace(traffic_flow=garbage)))
+    assert_same(absent, predict(params, example.replace(traffic_flow=garbage)))
 
     plain = LaneGraphTask(dataclasses.replace(host, priors=PriorsConfig()))
     rest = restricted(params, jax.eval_shape(plain.init, jax.random.key(0), example))
-    same(absent, jax.jit(plain.predict)(rest, example))
+    assert_same(absent, jax.jit(plain.predict)(rest, example))
 
 
 def test_a_new_fusion_changes_nothing():
@@ -108,7 +105,7 @@ def test_both_hooks_read_the_traffic():
     rest = restricted(params, jax.eval_shape(plain.init, jax.random.key(0), example))
     predict = jax.jit(task.predict)
     without = predict(silent, example)
-    same(without, jax.jit(plain.predict)(rest, example))
+    assert_same(without, jax.jit(plain.predict)(rest, example))
     assert not np.array_equal(without.centerlines.points, predict(params, example).centerlines.points)
 
 

@@ -16,11 +16,6 @@ collections = pytest.importorskip("matplotlib.collections")
 colors = pytest.importorskip("matplotlib.colors")
 
 
-@pytest.fixture
-def ax():
-    return new_figure()[1][0, 0]
-
-
 def pixels(draw) -> np.ndarray:
     """Return the picture that `draw(ax)` gives, as (H, W, 4) uint8."""
     figure, axes = new_figure()

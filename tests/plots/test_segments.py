@@ -24,11 +24,6 @@ collections = pytest.importorskip("matplotlib.collections")
 colors = pytest.importorskip("matplotlib.colors")
 
 
-@pytest.fixture
-def ax():
-    return new_figure()[1][0, 0]
-
-
 def with_segments(padding=0.0):
     """Return an example whose segments are its lanes, with boundaries at their sides; a solid one and a dashed one."""
     example = fake_example(0, padding=padding)

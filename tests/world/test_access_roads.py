@@ -13,13 +13,13 @@ from hypothesis import strategies as st
 
 from tests.world.road_networks import heading
 from tflane_jax.errors import UserError
+from tflane_jax.geometry import wrap_angle
 from tflane_jax.limits import check_settings
 from tflane_jax.scene import LineType
 from tflane_jax.scene.logs import LaneSegment
 from tflane_jax.world.presets import REAL_LIKE
 from tflane_jax.world.roads.area import road_rings
 from tflane_jax.world.roads.config import RoadConfig, SceneKind
-from tflane_jax.world.roads.curves import wrap
 from tflane_jax.world.roads.cuts import SHORTEST, cut_lane, part_of, set_back
 from tflane_jax.world.roads.networks import RoadNetwork, build_road_network
 from tflane_jax.world.simulate import simulate
@@ -59,7 +59,7 @@ def access_lanes(net: RoadNetwork) -> tuple[list[LaneSegment], list[LaneSegment]
 
 
 def turn(lane: LaneSegment) -> float:
-    return float(wrap(heading(lane.centerline, 1) - heading(lane.centerline, 0)))
+    return float(wrap_angle(heading(lane.centerline, 1) - heading(lane.centerline, 0)))
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -89,7 +89,7 @@ def test_successors_start_where_lanes_end(kind):
             for j in lane.successors:
                 for name in LINES:
                     np.testing.assert_allclose(getattr(lane, name)[-1], getattr(segments[j], name)[0], atol=1e-9)
-                kink = wrap(heading(lane.centerline, 1) - heading(segments[j].centerline, 0))
+                kink = wrap_angle(heading(lane.centerline, 1) - heading(segments[j].centerline, 0))
                 assert abs(kink) < np.deg2rad(12.0)
 
 

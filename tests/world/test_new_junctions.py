@@ -12,10 +12,10 @@ import shapely
 
 from tests.world.road_networks import CONFIG, heading, turn_between
 from tflane_jax.errors import UserError
+from tflane_jax.geometry import wrap_angle
 from tflane_jax.limits import check_settings
 from tflane_jax.world.roads.area import road_rings
 from tflane_jax.world.roads.config import RoadConfig, SceneKind
-from tflane_jax.world.roads.curves import wrap
 from tflane_jax.world.roads.lane_network import LaneEnd
 from tflane_jax.world.roads.movements import LEFT, RIGHT, Approach, plan_movements
 from tflane_jax.world.roads.networks import RoadNetwork, build_road_network
@@ -80,7 +80,7 @@ def test_connectors_can_be_driven(kind):
         for i, s in connectors(net).items():
             assert turn_between(s, segments[s.successors[0]]) < math.radians(8.0)
             step = np.diff(s.centerline[:, :2], axis=0)
-            turn = wrap(np.diff(np.arctan2(step[:, 1], step[:, 0])))
+            turn = wrap_angle(np.diff(np.arctan2(step[:, 1], step[:, 0])))
             length = np.linalg.norm(step, axis=-1)
             # Over any 3 m: the inner wheels of a car turn on a radius of 3.5 m or more.
             along = np.concatenate([[0.0], np.cumsum(length)])

@@ -12,7 +12,7 @@ from tests.world.perfect_tracker import PERFECT
 from tflane_jax.geometry import transform_points, yaw_pose
 from tflane_jax.scene import RoadUser
 from tflane_jax.scene.logs import Tracks
-from tflane_jax.world.traffic.tracker import TrackerConfig, track, visible_share, wrap_angle
+from tflane_jax.world.traffic.tracker import TrackerConfig, track, visible_share, wrap_outside
 
 NO_BUILDINGS = np.zeros((0, 5))
 CAR, TRUCK = (4.5, 1.9, 1.5), (9.0, 2.4, 3.5)
@@ -202,7 +202,7 @@ def test_padding_is_never_read():
 @settings(max_examples=50)
 @given(st.floats(-50.0, 50.0))
 def test_wrapped_angles_point_the_same_way(angle):
-    wrapped = float(wrap_angle(np.array(angle)))
+    wrapped = float(wrap_outside(np.array(angle)))
     assert -math.pi < wrapped <= math.pi
     assert math.cos(wrapped - angle) == pytest.approx(1.0, abs=1e-9)
     if -math.pi < angle <= math.pi:

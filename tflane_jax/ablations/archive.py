@@ -37,7 +37,7 @@ LARGEST_FILE, LARGEST_TEXT = 2**23, 2**26
 _LARGEST_NUMBER = 2**53
 _LONGEST_TEXT = 300
 _STEPS = 10**DIGITS
-"""In a file, scores in samples are multiples of one by this."""
+"""Files hold scores of samples as integers: the score times this."""
 
 T = TypeVar("T")
 

@@ -32,7 +32,7 @@ from tflane_jax.ablations.carry_over_plan import (
     recorded_logs,
     with_trainings,
 )
-from tflane_jax.ablations.comparison import Scores, Variant, compact
+from tflane_jax.ablations.comparison import Scores, compact
 from tflane_jax.ablations.declaration import Claim, Declaration, Declared, check, declare, model_of_row
 from tflane_jax.ablations.finished_runs import draw_models, summary_of
 from tflane_jax.ablations.jobs import Failure, Job, check_rows
@@ -41,12 +41,13 @@ from tflane_jax.ablations.statistics import holm, paired_difference
 from tflane_jax.ablations.store import remaining_seconds, runs_elsewhere
 from tflane_jax.ablations.workers import noted, train_all, worker_threads
 from tflane_jax.errors import UserError
+from tflane_jax.evaluation.interventions import NO_TRAFFIC
 from tflane_jax.plots.tables import format_table, save_table
 from tflane_jax.progress import progress_bar
 from tflane_jax.runs import open_run
 from tflane_jax.tasks import Model
 
-NONE, OTHER = "no traffic flow at inference", "traffic of another log"
+OTHER = "traffic of another log"
 PRIMARY = "all/recall"
 _ONE_TRAINING = "Each model was trained once: p is about other logs, not about other trainings."
 COLUMNS = ("all/recall", "all/DET_l", "all/TOP_ll", "occluded/recall")
@@ -56,10 +57,10 @@ CLAIMS = (
     Claim("mixed", "generated", "maps of other logs help on a log that was never seen"),
     Claim("mixed", "maps", "generated roads help beside them"),
     Claim("mixed", "mixed without traffic", "traffic flow helps a model that is trained with it"),
-    Claim("mixed", f"mixed, {NONE}", "this model uses the traffic"),
+    Claim("mixed", f"mixed, {NO_TRAFFIC}", "this model uses the traffic"),
     Claim("mixed", f"mixed, {OTHER}", "it uses what the traffic tells of this place"),
     Claim("mixed + BEV", "mixed", "traffic in the BEV features helps beside that in the queries"),
-    Claim("mixed + BEV", f"mixed + BEV, {NONE}", "this model uses the traffic"),
+    Claim("mixed + BEV", f"mixed + BEV, {NO_TRAFFIC}", "this model uses the traffic"),
     Claim("mixed + BEV", f"mixed + BEV, {OTHER}", "it uses what the traffic tells of this place"),
 )
 FITTED = (
@@ -68,7 +69,7 @@ FITTED = (
     "tested log that is one of the nine is known that far."
 )
 """What the models know of the logs that they are tested on, for every page."""
-# Of which two are drawn, the first that there are.
+# Models to draw, preferred first; the first two with a run are drawn.
 _DRAWN = ("mixed + BEV", "generated", "mixed")
 # Training of one model on one core of the machine of docs/benchmarks.md, for estimates.
 _MINUTES = 40.0
@@ -130,8 +131,8 @@ def carry_over(settings: Settings, out: Path) -> Path:
 def _evaluated(plan: Plan, failures: list[Failure]) -> tuple[ByLog, dict[str, set[int]], str]:
     """Return the scores of all finished runs on the logs that they have not seen, seeds by log, and the protocol.
 
-    The seeds of a log are those of which every model was tested on it. Means are over these alone, so that models are
-    compared on the same seeds where trainings failed.
+    A log counts only seeds with which every model was tested on it, so that failed trainings do not bias the
+    comparison.
     """
     found: dict[str, dict[str, dict[int, Scores]]] = {}
     protocol, failed = "", {failure.job.folder for failure in failures}
@@ -144,10 +145,10 @@ def _evaluated(plan: Plan, failures: list[Failure]) -> tuple[ByLog, dict[str, se
                 own = measure(job, on_log(job.config, log), "last")
                 assert own is not None
                 protocol, ways = own.protocol, {row: own.ways[""]}
-                if NONE in own.ways:  # the model reads traffic
+                if NO_TRAFFIC in own.ways:  # the model reads traffic
                     swapped = measure(job, on_log(job.config, log, plan.other(log)), "last")
                     assert swapped is not None
-                    ways |= {f"{row}, {NONE}": own.ways[NONE], f"{row}, {OTHER}": swapped.ways[""]}
+                    ways |= {f"{row}, {NO_TRAFFIC}": own.ways[NO_TRAFFIC], f"{row}, {OTHER}": swapped.ways[""]}
                 for name, scores in ways.items():
                     of_log = found.setdefault(name, {}).setdefault(log, {})
                     of_log[job.config.training.seeds[0]] = scores
@@ -185,7 +186,7 @@ def _save(
     ending = " ".join(filter(None, [".", interim, FITTED]))
     meta = {"logs": logs, "seeds": list(seeds), "protocol": protocol, "quick": quick, "fitted": FITTED}
     columns = [key for key in COLUMNS if all(key in found[row][log] for row in found for log in logs)]
-    rows = compact([Variant(row, tuple(by_log[log] for log in logs)) for row, by_log in found.items()], columns)
+    rows = compact({row: [by_log[log] for log in logs] for row, by_log in found.items()}, columns)
     title = f"{note}{protocol}; logs that were never seen, percent (mean ± std over {len(logs)} logs){ending}"
     path, _ = save_table(out / "carry_over", rows, meta, title=title)
     print("\n" + format_table(rows, title=title))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,20 +11,7 @@ from jaxtyping import Float
 from tflane_jax.ablations.statistics import holm, paired_difference
 
 Scores = dict[str, float]
-"""Metrics by "group/name", as `tasks.Evaluation.scores` returns them."""
-
-
-@dataclass(frozen=True)
-class Variant:
-    """A row of the table.
-
-    Attributes:
-        name: of the row.
-        scores: of each seed.
-    """
-
-    name: str
-    scores: tuple[Scores, ...]
+"""Metrics by "group/name", as `evaluation.results.Evaluation.scores` returns them."""
 
 
 def summarise(
@@ -65,17 +51,22 @@ def shared_seeds(one: Mapping[int, Scores], other: Mapping[int, Scores]) -> list
     return [seed for seed in one if seed in other]
 
 
-def compact(variants: Sequence[Variant], metrics: Sequence[str]) -> list[dict[str, str]]:
-    """Return one row for each variant with "mean ± std" in percent, as papers print tables; "n/a" if one is NaN."""
-    rows = []
-    for variant in variants:
-        row = {"model": variant.name}
+def compact(rows: Mapping[str, Collection[Scores]], metrics: Sequence[str]) -> list[dict[str, str]]:
+    """Return one row for each variant with "mean ± std" in percent, as papers print tables; "n/a" if one is NaN.
+
+    Args:
+        rows: scores of each variant, one for each seed.
+        metrics: names as in `Scores`.
+    """
+    found = []
+    for name, scores in rows.items():
+        row = {"model": name}
         for metric in metrics:
-            values = 100.0 * _column(variant.scores, metric)
+            values = 100.0 * _column(scores, metric)
             spread = f" ± {values.std(ddof=1):.1f}" if len(values) > 1 else ""
             row[metric] = f"{values.mean():.1f}{spread}" if np.isfinite(values).all() else "n/a"
-        rows.append(row)
-    return rows
+        found.append(row)
+    return found
 
 
 def _column(scores: Iterable[Scores], metric: str) -> Float[np.ndarray, " s"]:

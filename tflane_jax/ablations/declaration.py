@@ -116,7 +116,7 @@ class Declared:
 
 
 def check(declaration: Declaration, configs: Mapping[str, RunConfig]) -> None:
-    """Raise UserError for a score that is not measured, or a claim about rows that there are not."""
+    """Raise UserError for a score that is not measured, or a claim about a missing row."""
     for claim in declaration.claims:
         _check_claim(claim, list(configs))
     for name, config in configs.items():

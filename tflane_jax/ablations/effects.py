@@ -97,7 +97,7 @@ class Untested:
 
 @dataclass(frozen=True)
 class Tested:
-    """What became of the claims of a comparison.
+    """Effects and untested claims of a comparison.
 
     Attributes:
         effects: at every checkpoint, in the order of measures and claims.

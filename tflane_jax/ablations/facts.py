@@ -12,7 +12,7 @@ from tflane_jax.training.records import read_records
 
 
 def facts(job: Job) -> Facts:
-    """Return what a table tells of a finished run beside its scores."""
+    """Return provenance, duration and validation curve of a finished run."""
     if job.recorded is not None:
         return job.recorded.facts
     starts, records = read_provenance(job.folder), read_records(job.folder / "metrics.jsonl")

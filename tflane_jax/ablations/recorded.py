@@ -37,7 +37,7 @@ class Measured:
 
 @dataclass(frozen=True)
 class Facts:
-    """What a table tells of a run beside its scores.
+    """Provenance, duration and validation curve of a run.
 
     Attributes:
         commits: of the code that trained it, nine digits each, in order; one whose code was changed says so.

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from tflane_jax.ablations.comparison import Variant, compact, shared_seeds, summarise
+from tflane_jax.ablations.comparison import compact, shared_seeds, summarise
 from tflane_jax.ablations.jobs import file_names
 from tflane_jax.ablations.results import Results
 from tflane_jax.ablations.scores import CHECKPOINTS, OWN_TEST
@@ -60,7 +60,7 @@ def _save_table(
     rows: list[dict[str, Any]] = []
     for which in CHECKPOINTS:
         for row, by_seed in results.rows(test, which).items():
-            (cells,) = compact([Variant(row, tuple(by_seed.values()))], metrics)
+            (cells,) = compact({row: by_seed.values()}, metrics)
             cells = {"model": row, "checkpoint": which} | cells
             if which == "last":
                 cells |= remarks.get(row, {})

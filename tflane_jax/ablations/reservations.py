@@ -2,7 +2,7 @@
 
 A reservation is a file beside the run's folder that only one process can create. Its holder renews the file's time
 while it trains. A reservation is void when its process is gone (on the same machine) or when it has not been renewed
-for three minutes, as measured by the clock of whoever waits, so that clocks need not agree.
+for three minutes by the clock of the waiting process, so that the machines' clocks need not agree.
 """
 
 from __future__ import annotations

@@ -44,11 +44,11 @@ def with_test_set(config: RunConfig, settings: Sequence[str]) -> RunConfig:
             raise UserError(f"a test set changes settings of the data (--data...), {name} is none")
     if not settings:
         return config
-    return replace(config, data=_changed(replace(config, training=TrainingConfig()), tuple(settings)).data)
+    return replace(config, data=with_settings(replace(config, training=TrainingConfig()), tuple(settings)).data)
 
 
-@functools.lru_cache(maxsize=64)
-def _changed(config: RunConfig, settings: tuple[str, ...]) -> RunConfig:
+@functools.lru_cache(maxsize=256)
+def with_settings(config: RunConfig, settings: tuple[str, ...]) -> RunConfig:
     """Apply settings; cached, because this takes a second and is the same for all seeds."""
     return apply_overrides(config, settings)
 

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import functools
 import importlib.util
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
-from tflane_jax.ablations.comparison import Variant, compact
+from tflane_jax.ablations.comparison import compact
+from tflane_jax.ablations.scores import with_settings
 from tflane_jax.config import RunConfig
-from tflane_jax.config_overrides import apply_overrides
 from tflane_jax.errors import UserError
 from tflane_jax.plots.tables import format_table, save_table
 from tflane_jax.progress import progress_bar
@@ -78,8 +77,8 @@ def sweep(
     metrics = metrics or [name for name in task.compared if name in known]
     rows = []
     for i, value in enumerate(values):
-        variants = [Variant(name, tuple(by_value[i])) for name, by_value in scores.items()]
-        rows += [{setting: value} | row for row in compact(variants, metrics)]
+        found = compact({name: by_value[i] for name, by_value in scores.items()}, metrics)
+        rows += [{setting: value} | row for row in found]
     title = f"{protocol}, test split, {which} checkpoint, percent (mean ± std over seeds)"
     print("\n" + format_table(rows, title=title))
     out.mkdir(parents=True, exist_ok=True)
@@ -96,7 +95,7 @@ def sweep(
 def _tested(config: RunConfig, *arguments: str) -> RunConfig:
     """Return a run's configuration with other settings of data and evaluation; raises UserError for others."""
     common = replace(config, training=replace(config.training, seeds=(0,), init_from=None))
-    changed = _overridden(common, arguments)
+    changed = with_settings(common, arguments)
     if replace(changed, data=common.data, evaluation=common.evaluation) != common:
         given = ", ".join(argument for argument in arguments if argument.startswith("--"))
         raise UserError(
@@ -104,12 +103,6 @@ def _tested(config: RunConfig, *arguments: str) -> RunConfig:
             f"trained already: got {given}"
         )
     return replace(config, data=changed.data, evaluation=changed.evaluation)
-
-
-@functools.lru_cache(maxsize=256)
-def _overridden(config: RunConfig, arguments: tuple[str, ...]) -> RunConfig:
-    """Apply settings; cached, because this takes a second and is the same for all seeds."""
-    return apply_overrides(config, arguments)
 
 
 def _check_metrics(metrics: Collection[str], known: Collection[str]) -> None:

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from tflane_jax.ablations.archive import Archive, write_archive
-from tflane_jax.ablations.comparison import Variant, compact
+from tflane_jax.ablations.comparison import compact
 from tflane_jax.ablations.declaration import FILE as DECLARATION
 from tflane_jax.ablations.declaration import Declared, declare
 from tflane_jax.ablations.effects import Tested, judged_claims
@@ -84,8 +84,7 @@ def run_table(
         UserError: trainings failed, after the files of the others were written.
     """
     began, folder = time.monotonic(), store_of(out, quick=quick).parent / table.name
-    how: dict[str, Any] = {"quick": quick, "archive": archive, "scored_by": scored_by}
-    planned = plan_table(table, seeds, out, jobs=jobs, cores=cores, **how)
+    planned = plan_table(table, seeds, out, jobs=jobs, cores=cores, quick=quick, archive=archive, scored_by=scored_by)
     configs, plan = planned.rows, planned.jobs
     # Fewer seeds than the table has are an interim look at it.
     every = range(max(len(seeds), 0 if quick else table.seeds))
@@ -155,7 +154,7 @@ def _rows(table: PaperTable, results: Results) -> list[dict[str, Any]]:
         for name, by_seed in results.rows(OWN_TEST, which).items():
             wanted = [score for column in table.columns for score in (column, column + GEOMETRIC)]
             columns = [score for score in wanted if all(score in scores for scores in by_seed.values())]
-            (cells,) = compact([Variant(name, tuple(by_seed.values()))], columns)
+            (cells,) = compact({name: by_seed.values()}, columns)
             rows.append({"model": name, "checkpoint": which, "seeds": len(by_seed)} | cells)
     return rows
 

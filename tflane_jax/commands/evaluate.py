@@ -100,7 +100,7 @@ def _save_errors(run: Run, task: Any, source: Any, stem: Path, meta: dict[str, A
         confidence = errors.threshold if math.isfinite(errors.threshold) else None  # no detection finds a lane
         for name, counts in (("true lanes", errors.lanes), ("detections", errors.detections)):
             every = sum(counts.values())
-            fractions = {fate: 100.0 * number / every if every else 0.0 for fate, number in counts.items()}
+            fractions = {outcome: 100.0 * number / every if every else 0.0 for outcome, number in counts.items()}
             rows.append({"of": name, "seed": seed, "number": every, "confidence": confidence} | fractions)
     title = "why lanes are not found, percent; detections with at least the confidence of the best F-score"
     print(f"\n{format_table(rows, title=title)}")

@@ -13,7 +13,7 @@ from tflane_jax.datasets.base import SPLITS, Split
 from tflane_jax.datasets.data_source import Choice, DataSource
 from tflane_jax.datasets.sources import SOURCES, named_source, source_name, source_names, source_of
 from tflane_jax.errors import UserError
-from tflane_jax.run_checks import KINDS, check_kind
+from tflane_jax.run_checks import EXAMPLE_NAMES, check_kind
 from tflane_jax.runs import Run, open_run, open_weights
 from tflane_jax.scene import Example, RoadImage
 from tflane_jax.tasks.fit import check_settings_fit
@@ -142,7 +142,8 @@ def _check_choice(source: DataSource[Any], kind: type[Any], options: argparse.Na
     if source.example is not kind:
         names = source_names(kind)
         raise UserError(
-            f"--data {source.name} are no {KINDS[kind]}: this model takes {', '.join(names[:-1])} or {names[-1]}"
+            f"--data {source.name} are no {EXAMPLE_NAMES[kind]}: "
+            f"this model takes {', '.join(names[:-1])} or {names[-1]}"
         )
     if options.data is None and source.root is None:
         rooted = [f"--data {one.name}" for one in SOURCES if one.root is not None and one.example is kind]

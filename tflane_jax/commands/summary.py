@@ -48,7 +48,7 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> int:
             "batch": each.batch,
             "GFLOP": each.gflop,
             "memory, MiB": each.memory,
-            "of it intermediate": each.between,
+            "of that temporary": each.temporary,
             "compile, s": each.compile_s,
         }
         for each in programs

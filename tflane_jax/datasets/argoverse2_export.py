@@ -28,7 +28,7 @@ CATEGORY = {
     RoadUser.PEDESTRIAN: "PEDESTRIAN",
 }
 """Argoverse 2 category that stands for each road user."""
-# The vehicle itself is a track, as the tools of Argoverse write it: a frame in which nobody else is has a row, too.
+# The vehicle itself is a track, as the tools of Argoverse write it: a frame without other road users has a row, too.
 _EGO, _EGO_SIZE = "EGO_VEHICLE", (4.9, 1.9, 1.7)
 
 

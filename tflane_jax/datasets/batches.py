@@ -20,7 +20,7 @@ from jaxtyping import Int
 
 from tflane_jax.datasets.base import FrameInfo
 from tflane_jax.datasets.streaming import InOrder, Prepare, Request, Streamed, StreamingConfig
-from tflane_jax.scene import stack_examples
+from tflane_jax.scene import row_of, stack_examples
 
 __all__ = [
     "Prepare",
@@ -62,7 +62,7 @@ def count(arrays: Any) -> int:
 
 def first_example(arrays: Any) -> Any:
     """Return one example."""
-    return arrays.example(0) if isinstance(arrays, Streamed) else _row(arrays, 0)
+    return arrays.example(0) if isinstance(arrays, Streamed) else row_of(arrays, 0)
 
 
 def chosen_examples(arrays: Any, indices: Sequence[int]) -> Any:
@@ -86,7 +86,7 @@ def in_workers(arrays: Any, config: StreamingConfig) -> Any:
 def prepared(batch: Any, prepare: Prepare, seed: int, step: int) -> Any:
     """Return stacked examples, augmented as in the given step."""
     size = len(jax.tree.leaves(batch)[0])
-    return stack_examples([prepare(_row(batch, i), (seed, step, i)) for i in range(size)])
+    return stack_examples([prepare(row_of(batch, i), (seed, step, i)) for i in range(size)])
 
 
 def batches(
@@ -129,7 +129,7 @@ def batches(
             part = jax.tree.map(lambda leaf, indices=indices: leaf[indices], arrays)
             if prepare is not None:
                 keys = [(seed, step, place) for place in order.places]
-                part = stack_examples([prepare(_row(part, i), key) for i, key in enumerate(keys)])
+                part = stack_examples([prepare(row_of(part, i), key) for i, key in enumerate(keys)])
             parts.append(part)
         return parts
 
@@ -182,10 +182,6 @@ def _nothing() -> Generator[Any]:
     yield from ()
 
 
-def _row(batch: Any, index: int) -> Any:
-    return jax.tree.map(lambda leaf: leaf[index], batch)
-
-
 @dataclass(frozen=True)
 class _Order:
     """Requests of a training: by step, then by seed, then by place in this process's part of the batch."""
@@ -216,7 +212,7 @@ class _Rows:
         return count(self.arrays)
 
     def example(self, index: int) -> Any:
-        return _row(self.arrays, index)
+        return row_of(self.arrays, index)
 
     def info(self, index: int) -> FrameInfo:
         return FrameInfo(self.name, f"example {index}", 0, np.eye(4))

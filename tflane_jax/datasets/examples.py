@@ -15,7 +15,15 @@ from tflane_jax.datasets.ground_truth import lane_graph, traffic_elements
 from tflane_jax.datasets.map_lines import crop_map_lines
 from tflane_jax.datasets.marker_observations import marker_observations
 from tflane_jax.datasets.prepared_map import PreparedMap, prepare_map
-from tflane_jax.geometry import PerceptionRange, invert_pose, pose_yaw, relative_pose, transform_points, yaw_pose
+from tflane_jax.geometry import (
+    PerceptionRange,
+    invert_pose,
+    pose_yaw,
+    relative_pose,
+    transform_points,
+    wrap_angle,
+    yaw_pose,
+)
 from tflane_jax.scene import Example, MarkerObservations, TrafficFlow
 from tflane_jax.scene.logs import Log, Tracks
 from tflane_jax.world.bev.sensor import BevSensorConfig, hidden_cells, render_bev
@@ -79,7 +87,7 @@ def _moved(
     target_from_frame = relative_pose(target, poses[frames])  # Eq. (1)
     position = transform_points(target_from_frame, tracks.position[frames[:, None], rows])
     yaw = tracks.yaw[frames[:, None], rows] + pose_yaw(target_from_frame)[:, None]
-    return position, (yaw + np.pi) % (2 * np.pi) - np.pi
+    return position, wrap_angle(yaw)
 
 
 def make_example(log: Log, keyframe: int, config: ExampleConfig) -> Example:

@@ -227,12 +227,13 @@ def _shapely() -> Any:
     return shapely
 
 
-def join_ends(lines: Sequence[np.ndarray], tolerance: float = SAME_END) -> list[np.ndarray]:
+def join_ends(lines: Sequence[np.ndarray]) -> list[np.ndarray]:
     """Join lines end to end wherever exactly two ends meet, in either direction; a chain that comes back is a ring.
+
+    Ends meet within `SAME_END` in the ground plane.
 
     Args:
         lines: polylines (n, 3), at least two points each.
-        tolerance: ends nearer than this meet, metres in the ground plane.
     """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
@@ -242,7 +243,7 @@ def join_ends(lines: Sequence[np.ndarray], tolerance: float = SAME_END) -> list[
         return []
     # End 2 i is the start of line i, end 2 i + 1 its last point.
     ends = np.concatenate([[line[0, :2], line[-1, :2]] for line in lines])
-    pairs = KDTree(ends).query_pairs(tolerance, output_type="ndarray")
+    pairs = KDTree(ends).query_pairs(SAME_END, output_type="ndarray")
     size = (len(ends), len(ends))
     node = connected_components(coo_array((np.ones(len(pairs)), tuple(pairs.T)), shape=size), directed=False)[1]
     partner: dict[int, int] = {}

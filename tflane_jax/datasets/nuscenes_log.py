@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, Int
 from tflane_jax.datasets.nuscenes_tables import Row, Tables, poses_of, vectors
 from tflane_jax.datasets.plausible import check_distance, check_interval, check_motion, check_place
 from tflane_jax.errors import UserError
-from tflane_jax.geometry import invert_pose, pose_yaw, relative_pose, transform_points, yaw_pose
+from tflane_jax.geometry import invert_pose, pose_yaw, relative_pose, transform_points, wrap_angle, yaw_pose
 from tflane_jax.scene import RoadUser
 from tflane_jax.scene.logs import KeyFrame, Log, Side, Tracks, VectorMap
 
@@ -120,7 +120,6 @@ def scene_log(
     frames: SceneFrames,
     vector_map: VectorMap | None,
     *,
-    categories: Mapping[str, RoadUser | None] = CATEGORIES,
     least_visibility: Visibility = "v0-40",
 ) -> Log:
     """Return a scene as a log.
@@ -128,7 +127,6 @@ def scene_log(
     Args:
         tables, scene, frames: see `scene_frames`.
         vector_map: around the scene, global metres; None leaves it empty.
-        categories: road user of each category, None to leave it out, see `road_user`.
         least_visibility: boxes of a lower level count as occluded, as those without lidar and radar points always do.
 
     Raises:
@@ -139,7 +137,7 @@ def scene_log(
         lanes = [lane.centerline for lane in vector_map.segments.values()]
         where = f"{scene['name']} on the map of {tables.location(scene)}"
         check_place(lanes, frames.global_from_frame[:, :2, 3], where)
-    tracks = scene_tracks(tables, frames, categories, least_visibility)
+    tracks = scene_tracks(tables, frames, CATEGORIES, least_visibility)
     return Log(
         name=scene["name"],
         source="nuscenes",
@@ -196,7 +194,7 @@ def scene_tracks(
     check_distance(ego_centre[:, 0], where)
     tracks.position[f, k] = transform_points(frame_from_ego, ego_centre)[:, 0]
     yaw = pose_yaw(pose) - pose_yaw(global_from_ego) + pose_yaw(frame_from_ego)
-    tracks.yaw[f, k] = (yaw + np.pi) % (2 * np.pi) - np.pi
+    tracks.yaw[f, k] = wrap_angle(yaw)
     tracks.occluded[f, k] = _unseen(tables, rows, where, least_visibility)
     tracks.valid[f, k] = True
     return tracks

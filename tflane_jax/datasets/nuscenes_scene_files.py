@@ -31,7 +31,7 @@ from tflane_jax.datasets.plausible import LONGEST, SHORTEST, check_distance, che
 from tflane_jax.errors import UserError
 from tflane_jax.files.fields import member, numbers, shown
 from tflane_jax.files.npz import read_npz
-from tflane_jax.geometry import invert_pose, transform_points, yaw_pose
+from tflane_jax.geometry import invert_pose, transform_points, wrap_angle, yaw_pose
 from tflane_jax.scene import LineType, RoadUser
 from tflane_jax.scene.logs import KeyFrame, LaneSegment, Log, Tracks, VectorMap
 
@@ -163,7 +163,7 @@ def _tracks(
     seen = np.argwhere(valid)
     check_distance(position[valid], [f"{path}: position[{f}, {kept[k]}]" for f, k in seen])
     tracks.position[:] = np.where(valid[..., None], position, 0.0)
-    tracks.yaw[:] = np.where(valid, (yaw + np.pi) % (2 * np.pi) - np.pi, 0.0)
+    tracks.yaw[:] = np.where(valid, wrap_angle(yaw), 0.0)
     return tracks
 
 

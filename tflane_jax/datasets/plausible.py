@@ -1,4 +1,4 @@
-"""What cannot be true of a drive: a vehicle that jumps, a map of another place, a box that nobody can have seen.
+"""Plausibility checks of a drive: jumps of the vehicle, a map of another place, boxes too far away to be seen.
 
 Such files would give examples without lanes or with senseless traffic, and no error. A line of a map with one
 coordinate of thousands of kilometres would fill the memory with its points.

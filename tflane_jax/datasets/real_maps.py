@@ -130,8 +130,8 @@ class RealMapData:
         without: names of logs that no split takes.
         test_on: whether the test split is simulated on maps, or is what was recorded: the logs' own key frames and
             tracks, see `recorded_logs`.
-        test_traffic: name of a log whose recorded tracks replace those of the test split's logs, which is a check of
-            what a model makes of traffic that belongs elsewhere; "" for their own.
+        test_traffic: name of a log whose recorded tracks replace those of the test split's logs, a control: plausible
+            traffic in the wrong place; "" for their own.
         generated: fraction of the training scenes on generated roads.
         world: traffic, tracker and key frames of the scenes on maps.
         generated_world: all of the scenes on generated roads.

@@ -25,7 +25,7 @@ from tflane_jax.metrics.centerline_matching import LANE_THRESHOLDS
 from tflane_jax.metrics.frechet import pair_frechet
 from tflane_jax.models.host import HostConfig
 from tflane_jax.models.parameters import Params, split_statistics
-from tflane_jax.scene import CenterlinePrediction, Example, LaneGraph, Prediction, TrafficFlow
+from tflane_jax.scene import CenterlinePrediction, Example, LaneGraph, Prediction, TrafficFlow, row_of
 
 
 class HostPredictor(Predictor, Protocol):
@@ -106,7 +106,7 @@ def lanes_by_gain(
     others = repeat(None, len(own)) if baseline is None else _frames(*baseline, examples, batch_size)
     gains = []
     for i, (found, without, other) in enumerate(zip(own, none, others, strict=True)):
-        example: Example = _row(examples, i)
+        example: Example = row_of(examples, i)
         truth, lanes = _truth(task, example), valid_lanes(task, example)
         score, query = lane_scores(found, lanes)
         less = lane_scores(without, lanes)[0]
@@ -132,7 +132,7 @@ def road_user_effects(
     _, weights = traffic_attention(task.model, params, jax.tree.map(lambda leaf: np.asarray(leaf)[rows], examples))
     prior: Any = task.model.build_priors()["traffic_flow"]
     for lane, attention in zip(lanes, weights, strict=True):
-        example: Example = _row(examples, lane.example)
+        example: Example = row_of(examples, lane.example)
         tokens, flow = prior.observe(example, None)[0], _flow(example)
         users, points = tokens.index[tokens.valid], valid_lanes(task, example)[[lane.lane]]
         absent = each_alone(users, len(flow.valid))
@@ -255,7 +255,7 @@ def fading_scores(
         length: number of road users taken away at most.
         batch_size: predicted at a time.
     """
-    example: Example = _row(examples, lane.example)
+    example: Example = row_of(examples, lane.example)
     absent = one_after_another(road_users[:length], len(_flow(example).valid))
     points = valid_lanes(task, example)[[lane.lane]]
     scores = scores_without(task, params, example, points, absent, batch_size=batch_size)[:, 0]
@@ -311,12 +311,8 @@ def _frames(task: HostPredictor, params: Params, examples: Any, batch_size: int)
     """Yield the predicted lanes of each example, those of lane segments by their centerlines and first class."""
     for indices, answer in predictions(task, params, examples, batch_size):
         for i in range(len(indices)):
-            lanes = _row(answer, i)
+            lanes: Any = row_of(answer, i)
             if _of_segments(task):
                 yield CenterlinePrediction(lanes.segments.points, lanes.segments.logits[:, :1])
             else:
                 yield lanes.centerlines
-
-
-def _row(stacked: Any, index: int) -> Any:
-    return jax.tree.map(lambda leaf: np.asarray(leaf[index]), stacked)

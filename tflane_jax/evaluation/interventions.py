@@ -15,6 +15,8 @@ from tflane_jax.errors import UserError
 from tflane_jax.evaluation.results import EvaluationConfig, Traffic
 from tflane_jax.scene import Example, TrafficFlow
 
+NO_TRAFFIC = "no traffic flow at inference"
+"""Name of the intervention in which a model that was trained with traffic flow gets none."""
 _SEED = 0
 
 
@@ -47,7 +49,7 @@ def traffic_interventions(arrays: Example | Streamed, config: EvaluationConfig) 
     """
     if config.traffic != "own" or config.topology != "learned":
         return {}
-    found = {"no traffic flow at inference": replace(config, traffic="none")}
+    found = {NO_TRAFFIC: replace(config, traffic="none")}
     if len(np.unique(scene_numbers(arrays))) > 1:
         found["traffic of another scene"] = replace(config, traffic="other-scene")
     return found

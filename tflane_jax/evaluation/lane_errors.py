@@ -1,13 +1,13 @@
 """Why true lanes are not found, and why detections find none: by how much of their length has a counterpart.
 
 Recall and DET_l compare whole lanes, so a lane that is seen well, but cut elsewhere than the map cuts it, counts as a
-miss and as a false detection. Here every true lane and every detection gets one of `FATES`:
+miss and as a false detection. Here every true lane and every detection gets one of `OUTCOMES`:
 
 | | true lane | detection |
 |---|---|---|
 | `found` | a detection finds it (`evaluation.found_lanes`) | it is the most confident one that finds its lane |
-| `again` | | it finds a lane that a more confident one finds |
-| `other ends` | not found, at least `WHOLE` of it beside detections | finds none, at least `WHOLE` beside true lanes |
+| `duplicate` | | it finds a lane that a more confident one finds |
+| `wrong extent` | not found, `WHOLE` of it or more beside detections | finds none, `WHOLE` or more beside true lanes |
 | `in part` | at least `HALF` of it | the same |
 | `missed` | less | the same: a false detection |
 
@@ -36,7 +36,7 @@ from tflane_jax.metrics.segment_matching import nearest_segments
 from tflane_jax.models.parameters import Params
 from tflane_jax.scene import CenterlinePrediction, LaneGraph, Prediction, SegmentPrediction
 
-FATES: tuple[str, ...] = ("found", "again", "other ends", "in part", "missed")
+OUTCOMES: tuple[str, ...] = ("found", "duplicate", "wrong extent", "in part", "missed")
 WHOLE = 0.9
 
 
@@ -59,11 +59,11 @@ class Frame(NamedTuple):
 
 @dataclass(frozen=True)
 class LaneErrors:
-    """How many true lanes and detections have which fate.
+    """How many true lanes and detections have which outcome.
 
     Attributes:
         threshold: least confidence of the detections that count; inf if no detection finds a lane.
-        lanes, detections: numbers by `FATES`; no lane is found `again`.
+        lanes, detections: numbers by `OUTCOMES`; no lane is found `duplicate`.
     """
 
     threshold: float
@@ -72,7 +72,7 @@ class LaneErrors:
 
 
 def lane_errors(task: Predictor, params: Params, arrays: Any, batch_size: int = 16) -> LaneErrors:
-    """Return the fates of all true lanes of a data set, and of the detections of a model.
+    """Return the outcomes of all true lanes of a data set, and of the detections of a model.
 
     Centerlines are compared, or lane segments with their sides where the model predicts these.
 
@@ -113,17 +113,17 @@ def frame_of(truth: LaneGraph, found: CenterlinePrediction | SegmentPrediction) 
 
 
 def count_errors(frames: Sequence[Frame]) -> LaneErrors:
-    """Return how many lanes and detections have which fate."""
+    """Return how many lanes and detections have which outcome."""
     confidences = [highest_confidences(one.distance, one.nearest, one.scores, len(one.truth)) for one in frames]
     threshold = best_threshold(confidences, [one.scores for one in frames])
-    lanes, detections = dict.fromkeys(FATES, 0), dict.fromkeys(FATES, 0)
+    lanes, detections = dict.fromkeys(OUTCOMES, 0), dict.fromkeys(OUTCOMES, 0)
     for one, confidence in zip(frames, confidences, strict=True):
         kept = one.scores >= threshold
         points, distance, nearest, scores = (x[kept] for x in (one.points, one.distance, one.nearest, one.scores))
         finds = distance < WITHIN
         _count(lanes, covered_fraction(one.truth, points), found=confidence >= threshold)
         first = _first_of_lane(nearest, scores, finds)
-        _count(detections, covered_fraction(points, one.truth), found=first, again=finds & ~first)
+        _count(detections, covered_fraction(points, one.truth), found=first, duplicate=finds & ~first)
     return LaneErrors(threshold, lanes, detections)
 
 
@@ -139,12 +139,12 @@ def _first_of_lane(
 
 
 def _count(numbers: dict[str, int], covered: Float[np.ndarray, " n"], **settled: Bool[np.ndarray, " n"]) -> None:
-    """Add the fates of some lines: those that are settled, and for the others what their covered fraction says."""
+    """Add the outcomes of some lines: those that are settled, and for the others what their covered fraction says."""
     rest = np.ones(len(covered), bool)
-    for fate, members in settled.items():
-        numbers[fate] += int(members.sum())
+    for outcome, members in settled.items():
+        numbers[outcome] += int(members.sum())
         rest &= ~members
-    numbers["other ends"] += int((rest & (covered >= WHOLE)).sum())
+    numbers["wrong extent"] += int((rest & (covered >= WHOLE)).sum())
     numbers["in part"] += int((rest & (covered >= HALF) & (covered < WHOLE)).sum())
     numbers["missed"] += int((rest & (covered < HALF)).sum())
 

@@ -12,6 +12,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any, TypeVar
 
 import jax
@@ -40,7 +41,7 @@ from tflane_jax.metrics.resampling import Weights
 from tflane_jax.metrics.segment_matching import match_segments
 from tflane_jax.metrics.topology import Version
 from tflane_jax.models.parameters import Params
-from tflane_jax.scene import Example, MapLines, Prediction
+from tflane_jax.scene import Example, MapLines, Prediction, row_of
 
 T = TypeVar("T")
 
@@ -264,16 +265,16 @@ def _members(batch: Example, answer: Prediction, row: int, ground: PerceptionRan
     """Return the lane groups of one example by predicted part; none without a raster, its range, or traffic flow."""
     if ground is None or batch.bev is None or batch.traffic_flow is None:
         return {}
-    bev, flow = jax.tree.map(lambda leaf: np.asarray(leaf[row]), (batch.bev, batch.traffic_flow))
+    bev, flow = row_of((batch.bev, batch.traffic_flow), row)
     true = {"centerlines": batch.lanes, "segments": batch.segments}
     members: dict[str, Members] = {
-        part: lane_groups(jax.tree.map(lambda leaf: leaf[row], lanes), bev, flow, ground)
+        part: lane_groups(row_of(lanes, row), bev, flow, ground)
         for part, lanes in true.items()
         if getattr(answer, part) is not None
     }
     if answer.lines is not None and batch.map_lines is not None:
-        found, lines = jax.tree.map(lambda leaf: np.asarray(leaf[row]), (answer.lines, batch.map_lines))
-        members["lines"] = line_groups(lines.replace(valid=measured_lines(lines, found)), bev, flow, ground)
+        found, lines = row_of((answer.lines, batch.map_lines), row)
+        members["lines"] = line_groups(replace(lines, valid=measured_lines(lines, found)), bev, flow, ground)
     return members
 
 

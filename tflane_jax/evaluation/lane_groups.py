@@ -39,7 +39,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from scipy.ndimage import maximum_filter
 
-from tflane_jax.geometry import BevGrid, PerceptionRange, resample_lines
+from tflane_jax.geometry import BevGrid, PerceptionRange, resample_lines, wrap_angle
 from tflane_jax.scene import BevChannel, LaneGraph, LineClass, MapLines, RoadUser, TrafficFlow
 
 _EDGES = (BevChannel.LANE_PAINT, BevChannel.ROAD_EDGE)
@@ -151,7 +151,7 @@ def driven_fraction(
     distance = np.sqrt((x - along * step_x) ** 2 + (y - along * step_y) ** 2)
     lane, sample, piece = np.nonzero(distance <= beside)
     heading = yaw[piece] + along[lane, sample, piece] * turn[piece]
-    turned = np.abs(_wrapped(heading - direction[lane, sample]))
+    turned = np.abs(wrap_angle(heading - direction[lane, sample]))
     aligned = (np.minimum(turned, np.pi - turned) if directions == "both" else turned) <= HEADING
     driven = np.zeros(line.shape[:2], bool)
     driven[lane[aligned], sample[aligned]] = True
@@ -170,13 +170,8 @@ def _pieces(flow: TrafficFlow) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.n
     following = np.where(seen[instance, following], following, frame)
     position, yaw = np.asarray(flow.position)[..., :2], np.asarray(flow.yaw)
     start, heading = position[instance, frame], yaw[instance, frame]
-    return start, position[instance, following] - start, heading, _wrapped(yaw[instance, following] - heading)
+    return start, position[instance, following] - start, heading, wrap_angle(yaw[instance, following] - heading)
 
 
 def _samples(lines: Float[np.ndarray, "g n 3"]) -> Float[np.ndarray, "g s 2"]:
     return resample_lines(list(lines), SAMPLES)[..., :2]
-
-
-def _wrapped(angle: np.ndarray) -> np.ndarray:
-    """Return angles between -pi and pi."""
-    return (angle + np.pi) % (2 * np.pi) - np.pi

@@ -79,7 +79,7 @@ def _warn_of_others(folder: Path, names: Sequence[str], count: int) -> None:
 
 
 def unreadable(path: Path) -> str | None:
-    """Return why a path is none of a file; None if it is one. Devices are none: they may never end."""
+    """Return why a path cannot be read as a file; None if it can. Devices are refused: they may never end."""
     try:
         mode = path.stat().st_mode
     except OSError as error:

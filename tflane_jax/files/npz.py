@@ -21,7 +21,7 @@ _MOST_HELD = {zipfile.ZIP_STORED: 1, zipfile.ZIP_DEFLATED: 1032}
 
 
 def read_npz(path: Path, names: Collection[str] | None = None) -> dict[str, np.ndarray]:
-    """Return the arrays of a file by name; `names` are those wanted, of which some may be missing, None is for all.
+    """Return the arrays of a file by name; `names` are those to read: missing ones are left out, None reads all.
 
     Raises UserError for a file that is missing, damaged or no .npz.
     """

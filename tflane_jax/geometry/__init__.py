@@ -18,6 +18,7 @@ from tflane_jax.geometry.polylines import (
     resample,
     resample_lines,
     sample_at,
+    segment_distances,
 )
 from tflane_jax.geometry.poses import (
     invert_pose,
@@ -26,6 +27,7 @@ from tflane_jax.geometry.poses import (
     pose_yaw,
     relative_pose,
     transform_points,
+    wrap_angle,
     yaw_pose,
 )
 from tflane_jax.geometry.ranges import BevGrid, PerceptionRange
@@ -49,6 +51,8 @@ __all__ = [
     "resample_lines",
     "resize_intrinsics",
     "sample_at",
+    "segment_distances",
     "transform_points",
+    "wrap_angle",
     "yaw_pose",
 ]

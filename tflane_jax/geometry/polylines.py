@@ -105,6 +105,19 @@ def pad_lines(
     return np.concatenate([np.asarray(line, np.float64) for line in lines])[index]
 
 
+def segment_distances(
+    points: Float[AnyArray, "*b 2"], start: Float[AnyArray, "m 2"], step: Float[AnyArray, "m 2"]
+) -> tuple[Float[np.ndarray, "*b m"], Float[np.ndarray, "*b m"]]:
+    """Return where on each straight piece `start` to `start + step` each point is nearest, and the distances.
+
+    The first result is the fraction of the piece, in [0, 1]. A piece may have no length.
+    """
+    square = (step**2).sum(-1)
+    away = points[..., None, :] - start
+    t = np.clip((away * step).sum(-1) / np.where(square > 0.0, square, 1.0), 0.0, 1.0)
+    return t, np.linalg.norm(start + t[..., None] * step - points[..., None, :], axis=-1)
+
+
 def nearest_on(line: Float[AnyArray, "n d"], place: Float[AnyArray, "2"]) -> tuple[int, float, float]:
     """Return where a line passes nearest to a place, in the ground plane.
 
@@ -112,10 +125,7 @@ def nearest_on(line: Float[AnyArray, "n d"], place: Float[AnyArray, "2"]) -> tup
     """
     line = np.asarray(line)[:, :2]
     line = np.concatenate([line, line]) if len(line) == 1 else line
-    start, step = line[:-1], np.diff(line, axis=0)
-    square = (step**2).sum(-1)
-    t = np.clip(((place - start) * step).sum(-1) / np.where(square > 0.0, square, 1.0), 0.0, 1.0)
-    distance = np.linalg.norm(start + t[:, None] * step - place, axis=-1)
+    t, distance = segment_distances(np.asarray(place), line[:-1], np.diff(line, axis=0))
     nearest = int(distance.argmin())
     return nearest, float(t[nearest]), float(distance[nearest])
 

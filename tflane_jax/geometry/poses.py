@@ -8,9 +8,15 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 from jaxtyping import Float
 
 from tflane_jax.geometry.namespace import AnyArray, ArrayT, namespace
+
+
+def wrap_angle(angle: Float[np.ndarray, "*b"] | float) -> Float[np.ndarray, "*b"]:
+    """Return the angle in [-pi, pi)."""
+    return (np.asarray(angle) + np.pi) % (2 * np.pi) - np.pi
 
 
 def pose_matrix(rotation: Float[AnyArray, "*b d d"], translation: Float[AnyArray, "*b d"]) -> Float[Any, "*b d+1 d+1"]:

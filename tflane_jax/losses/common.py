@@ -8,7 +8,8 @@ from typing import Any, ClassVar, Literal
 import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Array, Bool, Float
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
 
 from tflane_jax.limits import PositiveOrZero
 from tflane_jax.matching import Assignment
@@ -139,6 +140,30 @@ def quality_focal(logits: Float[Array, "*b"], target: Float[Array, "*b"], gamma:
     if gamma < 1.0:  # A power below 1 has no finite slope at 0, which saturated logits reach.
         apart = jnp.maximum(apart, 1e-6)
     return apart**gamma * optax.losses.sigmoid_binary_cross_entropy(logits, target)
+
+
+def class_losses(
+    logits: Float[Array, "q c"],
+    query: Int[Array, " n"],
+    category: Int[Array, " n"] | int,
+    quality: Float[Array, " n"] | None,
+    alpha: float,
+    gamma: float,
+) -> Float[Array, "q c"]:
+    """Return the class loss of every query and class of one example.
+
+    Args:
+        logits: of the queries.
+        query: of each target; one that lies outside writes nowhere.
+        category: class of each target.
+        quality: of each target's prediction, the value to predict by `quality_focal`; without, it is 1 by `focal`.
+        alpha, gamma: see `focal`.
+    """
+    target = jnp.zeros(logits.shape)
+    if quality is None:
+        return focal(logits, target.at[query, category].set(1.0, mode="drop"), alpha, gamma)
+    target = target.at[query, category].set(lax.stop_gradient(quality), mode="drop")
+    return quality_focal(logits, target, gamma)
 
 
 def last_layers(assignment: Assignment, layers: int) -> Assignment:

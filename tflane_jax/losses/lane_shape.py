@@ -166,7 +166,7 @@ def lane_shape_loss(
     """
     every = lane_weights(targets, targets.valid)
     cost = jax.vmap(lambda p, t, w: matching_cost(p, t, w, config))(prediction, targets, every)
-    assignment = match(cost, targets.valid[:, None], config.matcher)  # z of Eq. (3), (B, D, L): one host call
+    assignment = match(cost, targets.valid[:, None], config.matcher)  # z of Eq. (3), (B, D, L): one call of `match`
     # The weights of a layer use the lanes matched in that layer.
     weights = jax.vmap(lambda which: lane_weights(targets, which), in_axes=1, out_axes=1)(assignment.matched)
     per_layer = jax.vmap(jax.vmap(lambda p, a, w, t: _terms(p, a, w, t, config), in_axes=(0, 0, 0, None)))

@@ -15,7 +15,6 @@ from typing import Any, Literal
 import jax
 import jax.numpy as jnp
 import optax
-from jax import lax
 from jaxtyping import Array, Float
 
 from tflane_jax.datasets.segment_targets import SegmentTargets
@@ -26,12 +25,11 @@ from tflane_jax.losses.common import (
     HostLossConfig,
     Report,
     Terms,
-    focal,
+    class_losses,
     last_layer,
     matched,
     matched_edge_sums,
     positives,
-    quality_focal,
     total,
 )
 from tflane_jax.losses.costs import dice_cost, focal_cost, mask_cost, pairwise_l1
@@ -253,12 +251,8 @@ def _layer_sums(
     # Index `queries` lies outside, so unmatched targets write nowhere.
     query = jnp.where(assignment.matched, assignment.query, len(logits))
     lines = _lines(prediction)[assignment.query]
-    target = jnp.zeros(logits.shape)
-    if config.class_target == "one":
-        classes = focal(logits, target.at[query, targets.category].set(1.0, mode="drop"), config.alpha, config.gamma)
-    else:
-        quality = lax.stop_gradient(segment_quality(lines, true))
-        classes = quality_focal(logits, target.at[query, targets.category].set(quality, mode="drop"), config.gamma)
+    quality = None if config.class_target == "one" else segment_quality(lines, true)
+    classes = class_losses(logits, query, targets.category, quality, config.alpha, config.gamma)
     cells = jnp.asarray(prediction.mask_logits)[assignment.query]
     sides = (prediction.left_type_logits, targets.left_type), (prediction.right_type_logits, targets.right_type)
     each = {

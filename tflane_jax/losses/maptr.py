@@ -26,11 +26,10 @@ from tflane_jax.losses.common import (
     HostLossConfig,
     Report,
     Terms,
-    focal,
+    class_losses,
     last_layer,
     matched,
     positives,
-    quality_focal,
     total,
 )
 from tflane_jax.losses.costs import focal_cost, pairwise_l1
@@ -223,12 +222,8 @@ def _layer_sums(
     # Index `queries` lies outside, so unmatched targets write nowhere.
     query = jnp.where(assignment.matched, assignment.query, len(logits))
     true = nearest_order(lines, targets, range_)
-    target = jnp.zeros(logits.shape)
-    if config.class_target == "one":
-        classes = focal(logits, target.at[query, targets.category].set(1.0, mode="drop"), config.alpha, config.gamma)
-    else:
-        quality = lax.stop_gradient(line_quality(lines, true))
-        classes = quality_focal(logits, target.at[query, targets.category].set(quality, mode="drop"), config.gamma)
+    quality = None if config.class_target == "one" else line_quality(lines, true)
+    classes = class_losses(logits, query, targets.category, quality, config.alpha, config.gamma)
     each = {
         "points": jnp.abs(range_.normalise(lines) - range_.normalise(true)).sum((1, 2)),
         "direction": direction_errors(lines, true, config.least_step).sum(1),

@@ -66,7 +66,7 @@ class MapTrV2LossConfig(MapTrLossConfig):
 
 
 def of_classes(lines: Any, classes: int) -> Any:
-    """Return map lines of which those of a class that the model does not have are not valid: no mask shows them."""
+    """Return map lines with those of classes that the model lacks marked invalid, so that no mask shows them."""
     return replace(lines, valid=lines.valid & (lines.category < classes))
 
 

@@ -13,7 +13,6 @@ from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Float, Int
 
 from tflane_jax.geometry.bezier import bezier_fit
@@ -23,13 +22,12 @@ from tflane_jax.losses.common import (
     HostLossConfig,
     Report,
     Terms,
+    class_losses,
     edge_loss,
-    focal,
     last_layer,
     last_layers,
     matched,
     positives,
-    quality_focal,
     total,
 )
 from tflane_jax.losses.costs import focal_cost, pairwise_l1
@@ -128,7 +126,7 @@ def lane_graph_loss(
     size: Int[Array, "b 2"] | None = None,
     control_points: int | None = None,
 ) -> tuple[Float[Array, ""], Report]:
-    """Return the loss of a batch and its terms; lanes and elements take one host call each for matching.
+    """Return the loss of a batch and its terms; lanes and elements take one call of `match` each.
 
     Args:
         prediction: outputs of every decoder layer, leading axes (batch, layer). A topology may have the last layers
@@ -152,7 +150,7 @@ def lane_graph_loss(
     # Padding may hold NaN; clear it, so that 0 * padding is 0.
     lanes = lanes.replace(points=jnp.where(lanes.valid[..., None, None], lanes.points, 0.0))  # pyright: ignore
     cost = jax.vmap(lambda p, g: matching_cost(p, g, config, control_points))(prediction.centerlines, lanes)
-    assignment = match(cost, lanes.valid[:, None], config.matcher)  # (B, D, N): one host call
+    assignment = match(cost, lanes.valid[:, None], config.matcher)  # (B, D, N): one call of `match`
     terms = lane_losses(prediction.centerlines, assignment, lanes, config, control_points)
     report = {"matching/lanes": matched(assignment)}
     if prediction.elements is not None:
@@ -251,13 +249,8 @@ def _lane_sums(
     # Index `queries` lies outside, so unmatched targets write nowhere.
     query = jnp.where(assignment.matched, assignment.query, len(logits))
     error = jnp.abs(_lines(points[assignment.query], control_points) - _lines(lanes.points, control_points)).sum(-1)
-    if config.class_target == "one":
-        is_lane = jnp.zeros(logits.shape).at[query, 0].set(1.0, mode="drop")
-        classes = focal(logits, is_lane, config.alpha, config.gamma)
-    else:
-        quality = lax.stop_gradient(lane_quality(points[assignment.query], lanes.points))
-        target = jnp.zeros(logits.shape).at[query, 0].set(quality, mode="drop")
-        classes = quality_focal(logits, target, config.gamma)
+    quality = None if config.class_target == "one" else lane_quality(points[assignment.query], lanes.points)
+    classes = class_losses(logits, query, 0, quality, config.alpha, config.gamma)
     return classes.sum(), jnp.where(assignment.matched, error, 0.0).sum()
 
 

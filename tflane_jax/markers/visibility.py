@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from tflane_jax.geometry import invert_pose, pose_yaw, relative_pose, transform_points, yaw_pose
 from tflane_jax.markers.square_pose import marker_outline
 from tflane_jax.scene.logs import KeyFrame, Log
-from tflane_jax.world.bev.line_of_sight import hidden_points
+from tflane_jax.world.bev.line_of_sight import hidden_points, occluders_from
 from tflane_jax.world.cameras.ring import CameraMount, CameraRigConfig, draw_rig
 from tflane_jax.world.render.camera import FrontCamera
 
@@ -78,11 +78,9 @@ def hidden_from(
     eye: Float[np.ndarray, "3"], points: Float[np.ndarray, "n 3"], boxes: Float[np.ndarray, "b 7"]
 ) -> Bool[np.ndarray, " n"]:
     """Return which points the boxes (as `Bodies.boxes`) hide from an eye, all in one frame."""
-    x, y, length, width, yaw, low, high = boxes.T
-    occluders = np.stack([x - eye[0], y - eye[1], length, width, yaw, high - low, low], -1)
     return hidden_points(
         points[:, :2] - eye[:2],
-        occluders,
+        occluders_from(boxes, eye),
         np.zeros((0, 5)),
         sensor_height=float(eye[2]),
         target_height=points[:, 2],

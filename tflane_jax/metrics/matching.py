@@ -95,15 +95,15 @@ def average_precision_area(scores: Float[np.ndarray, " p"], hits: Bool[np.ndarra
 
 
 def vertex_average_precision(
-    edges: Bool[np.ndarray, "*b v n"], confidence: Float[np.ndarray, "*b v n"], threshold: float = 0.5
+    edges: Bool[np.ndarray, "*b v n"], confidence: Float[np.ndarray, "*b v n"]
 ) -> Float[np.ndarray, "*b v"]:
     """Return for each vertex v the average precision of its n possible neighbours.
 
-    Entries with confidence above `threshold` (strictly) are predicted neighbours; true neighbours that are not
+    Entries with confidence above 0.5 (strictly) are predicted neighbours; true neighbours that are not
     predicted contribute 0. No true and no predicted neighbour is 1.
     """
     edges = np.broadcast_to(edges, confidence.shape)
-    predicted = confidence > threshold
+    predicted = confidence > 0.5
     # Hits are few: counting the entries before each one is faster than sorting.
     *vertex, neighbour = np.nonzero(edges & predicted)
     row, hit = confidence[*vertex], confidence[*vertex, neighbour][:, None]

@@ -22,7 +22,7 @@ Weights = Int[np.ndarray, "b f"]
 
 
 def frame_numbers(detections: Sequence[tuple[np.ndarray, ...]]) -> Int[np.ndarray, " p"]:
-    """Return the frame of each detection, pooled as by `matching.pooled`; each frame's first field is its scores."""
+    """Return each detection's frame, pooled as by `metrics.matching.pooled`; a frame's first field is its scores."""
     return np.repeat(np.arange(len(detections)), [len(scores) for scores, *_ in detections])
 
 
@@ -39,7 +39,7 @@ def resampled_precisions(
     truths: Int[np.ndarray, " f"],
     weights: Weights,
 ) -> tuple[Float[np.ndarray, "b k"], Float[np.ndarray, "b k"]]:
-    """Return `matching.average_precision_11` and `average_precision_area` of every sample, for K rows of hits.
+    """Return `metrics.matching.average_precision_11` and `average_precision_area` of every sample, for K rows of hits.
 
     Args:
         scores: of the detections of all frames.

@@ -13,9 +13,9 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
-def draw_temporal_mask(ax: Axes, frame_valid: Bool[Array, "t n"], *, title: str = "temporal mask") -> None:
+def draw_temporal_mask(ax: Axes, frame_valid: Bool[Array, "t n"]) -> None:
     """Draw which frames of each road user are attended to (light), oldest frame on the left."""
-    _grid(ax, np.asarray(frame_valid), title)
+    _grid(ax, np.asarray(frame_valid), "temporal mask")
     ax.set_xlabel("frame, oldest first", fontsize=8)
     ax.set_ylabel("road user", fontsize=8)
 

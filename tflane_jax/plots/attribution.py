@@ -19,10 +19,11 @@ FAINT = 0.12
 """Opacity of a track with weight 0; the largest weight of a picture has opacity 1."""
 
 
-def draw_lane_bands(ax: Axes, lanes: Float[Array, "g n 3"], colour: str = style.LANE_HIDDEN) -> None:
+def draw_lane_bands(ax: Axes, lanes: Float[Array, "g n 3"]) -> None:
     """Draw translucent bands of 2.6 m along lanes (metres, ego frame), under all other lines."""
     from matplotlib.collections import PolyCollection
 
+    colour = style.LANE_HIDDEN
     points = np.asarray(lanes, np.float64)[..., :2]
     step = np.gradient(points, axis=1)
     across = np.stack([-step[..., 1], step[..., 0]], -1)

@@ -42,6 +42,7 @@ Layer = Literal["evidence", "hidden", "areas", "lanes", "segments", "map_lines",
 GROUND = BevGrid().range
 VIEW = PerceptionRange()
 
+_EGO_SIZE = (4.8, 2.0)
 ALL_LAYERS: tuple[Layer, ...] = ("evidence", "hidden", "areas", "lanes", "traffic", "elements")
 
 
@@ -190,11 +191,11 @@ def draw_elements(ax: Axes, elements: TrafficElements) -> None:
         )
 
 
-def draw_ego(ax: Axes, size: tuple[float, float] = (4.8, 2.0)) -> None:
-    """Draw the ego vehicle (length, width in metres) at the origin, heading along x."""
+def draw_ego(ax: Axes) -> None:
+    """Draw the ego vehicle at the origin, heading along x."""
     from matplotlib.collections import PolyCollection
 
-    body = box_corners(np.zeros((1, 2)), np.zeros(1), np.asarray([size]))
+    body = box_corners(np.zeros((1, 2)), np.zeros(1), np.asarray([_EGO_SIZE]))
     ax.add_collection(PolyCollection(list(body), facecolors=style.EGO, edgecolors="black", linewidths=0.6, zorder=6.0))
     nose = np.asarray([[[1.6, 0.0], [0.2, 0.7], [0.2, -0.7]]])
     ax.add_collection(PolyCollection(list(nose), facecolors=style.ROAD, zorder=6.1))

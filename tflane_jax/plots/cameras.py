@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
-import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
@@ -32,6 +31,7 @@ from tflane_jax.scene import (
     LineType,
     SegmentPrediction,
     TrafficElements,
+    row_of,
 )
 
 if TYPE_CHECKING:
@@ -108,7 +108,7 @@ def save_camera_views(
     sizes |= {} if elements is None else {"elements": len(elements.box)}
     if any(size != count for size in sizes.values()):
         raise ValueError(f"{count} examples, but {sizes}")
-    first = _pick(examples, 0)
+    first = row_of(examples, 0)
     assert first.cameras is not None
     ahead, back = _rows_of_cameras(first.cameras)
     columns = max(len(ahead) + 1, len(back))
@@ -117,9 +117,9 @@ def save_camera_views(
     for ax in axes.flat:
         ax.set_axis_off()
     for row, title in enumerate(titles):
-        example = _pick(examples, row)
-        found = None if lanes is None else _pick(lanes, row)
-        boxes = None if elements is None else _pick(elements, row)
+        example = row_of(examples, row)
+        found = None if lanes is None else row_of(lanes, row)
+        boxes = None if elements is None else row_of(elements, row)
         for numbers, line in ((ahead, axes[2 * row]), (back, axes[2 * row + 1])):
             for number, ax in zip(numbers, line, strict=False):
                 draw_camera(ax, example, number, found, boxes, threshold=threshold)
@@ -327,7 +327,3 @@ def _direction_colours(angle: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n 
 
     hue = (angle / (2.0 * np.pi) + 1.0 / 3.0) % 1.0
     return hsv_to_rgb(np.stack([hue, np.full_like(hue, 0.75), np.ones_like(hue)], -1))
-
-
-def _pick(stacked: Tree, row: int) -> Tree:
-    return jax.tree.map(lambda leaf: np.asarray(leaf[row]), stacked)

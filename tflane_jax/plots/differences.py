@@ -18,13 +18,12 @@ from tflane_jax.plots.gallery import (
     boundary_entries,
     label_edges,
     panel_size,
-    pick,
     prediction_entries,
     visibility_entries,
 )
 from tflane_jax.plots.map_lines import class_entries
 from tflane_jax.plots.segments import LanePrediction, truth_lines
-from tflane_jax.scene import BevChannel, Example, RoadUser
+from tflane_jax.scene import BevChannel, Example, RoadUser, row_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -86,7 +85,7 @@ def save_differences(
     shown = next((findings.lanes for findings in models.values()), None)
     figure.suptitle(title, fontsize=13, x=0.01, ha="left")
     for row, (line, name) in enumerate(zip(axes, titles, strict=True)):
-        example, (truth, seen, *places) = pick(examples, row), line
+        example, (truth, seen, *places) = row_of(examples, row), line
         lanes = truth_lines(example, shown)
         draw_scene(
             truth,
@@ -103,7 +102,7 @@ def save_differences(
         for ax, (model, findings) in zip(places, models.items(), strict=True):
             found = findings.found[row] & outlined[row]
             name = f"{model}: finds {found.sum()} of {outlined[row].sum()} outlined"
-            prediction = pick(findings.lanes, row)
+            prediction = row_of(findings.lanes, row)
             draw_found(ax, example, prediction, ground=ground, view=view, threshold=findings.threshold, title=name)
             draw_outlines(ax, lanes[found], "filled")
             draw_outlines(ax, lanes[outlined[row] & ~found], "dashed")

@@ -6,7 +6,6 @@ from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypeVar
 
-import jax
 import numpy as np
 
 from tflane_jax.errors import UserError
@@ -16,7 +15,7 @@ from tflane_jax.plots.bev import GROUND, VIEW, Layer, draw_found, draw_scene, tr
 from tflane_jax.plots.figure import hide_unused, new_figure, save_figure
 from tflane_jax.plots.map_lines import class_entries
 from tflane_jax.plots.segments import LINE_STYLES, LanePrediction
-from tflane_jax.scene import Example, LineType
+from tflane_jax.scene import Example, LineType, row_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -73,7 +72,7 @@ def save_examples(
     lines = -(-panels // _MOST_COLUMNS)
     figure, axes = new_figure(count * lines, -(-panels // lines), panel=panel_size(view), footer=_FOOTER)
     for row, title in enumerate(titles):
-        example, (truth, seen, *places) = pick(examples, row), axes[row * lines : (row + 1) * lines].flat
+        example, (truth, seen, *places) = row_of(examples, row), axes[row * lines : (row + 1) * lines].flat
         columns, unused = places[: len(predictions)], places[len(predictions) :]
         for ax in unused:
             ax.set_axis_off()
@@ -89,7 +88,7 @@ def save_examples(
             seen, example, layers=("evidence", "traffic"), ground=ground, view=view, title="evidence and traffic"
         )
         for ax, (name, stacked) in zip(columns, predictions.items(), strict=True):
-            draw_found(ax, example, pick(stacked, row), ground=ground, view=view, threshold=threshold, title=name)
+            draw_found(ax, example, row_of(stacked, row), ground=ground, view=view, threshold=threshold, title=name)
     label_edges(axes)
     add_legend(figure, "with predictions" if predictions else "scenes", drawn=true)
     return save_figure(figure, path)
@@ -234,7 +233,3 @@ def label_edges(axes: np.ndarray) -> None:
         ax.set_ylabel("y, left [m]", fontsize=8)
     for ax in axes[:, 1:].flat:
         ax.tick_params(labelleft=False)
-
-
-def pick(stacked: Tree, row: int) -> Tree:
-    return jax.tree.map(lambda leaf: np.asarray(leaf[row]), stacked)

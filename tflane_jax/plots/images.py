@@ -7,7 +7,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import jax
 import numpy as np
 from jaxtyping import Float, UInt8
 
@@ -15,7 +14,7 @@ from tflane_jax.evaluation.lane_shapes import left_to_right
 from tflane_jax.files.images import opencv
 from tflane_jax.geometry.lane_shapes import curve_columns
 from tflane_jax.plots.figure import hide_unused, new_figure, save_figure
-from tflane_jax.scene import CurvePrediction, LaneLines, RoadImage
+from tflane_jax.scene import CurvePrediction, LaneLines, RoadImage, row_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -61,13 +60,13 @@ def save_road_images(
     rows = count if predictions else -(-count // columns)
     figure, axes = new_figure(rows, columns, panel=(4.8, 4.8 * height / width + 0.25))
     for row, (title, panels) in enumerate(zip(titles, axes.reshape(-1, 1 + len(predictions)), strict=False)):
-        example, (truth, *others) = _pick(examples, row), panels
+        example, (truth, *others) = row_of(examples, row), panels
         draw_image(truth, example.image, f"{title}: truth")
         draw_lines(truth, example.lines, (height, width), width=1.6)
         for ax, (name, stacked) in zip(others, predictions.items(), strict=True):
             draw_image(ax, example.image, name)
             draw_lines(ax, example.lines, (height, width), width=0.9, style="--")
-            draw_lanes(ax, predicted_lines(_pick(stacked, row), threshold) * [width, height])
+            draw_lanes(ax, predicted_lines(row_of(stacked, row), threshold) * [width, height])
     hide_unused(axes, count * (1 + len(predictions)))
     return save_figure(figure, path)
 
@@ -134,7 +133,3 @@ def draw_lanes(ax: Axes, lanes: Iterable[Float[np.ndarray, "p 2"]]) -> None:
     """Draw lanes, pixels, each in a colour of its own."""
     for lane, colour in zip(lanes, itertools.cycle(LANE_COLOURS), strict=False):
         ax.plot(lane[:, 0], lane[:, 1], color=colour, linewidth=2.2, solid_capstyle="round")
-
-
-def _pick(stacked, row: int):
-    return jax.tree.map(lambda leaf: np.asarray(leaf[row]), stacked)

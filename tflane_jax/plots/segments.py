@@ -89,13 +89,8 @@ def outline_of_sides(left: Float[np.ndarray, "n p 3"], right: Float[np.ndarray, 
     return np.concatenate([left, right[:, ::-1]], 1)
 
 
-def draw_segments(
-    ax: Axes, segments: LaneGraph, *, colour: str | None = None, width: float = 1.0, alpha: float = 1.0
-) -> None:
-    """Draw true segments: arrows along thin centerlines, and boundaries by type.
-
-    Without a `colour`, centerlines are coloured by visibility, and boundaries are light.
-    """
+def draw_segments(ax: Axes, segments: LaneGraph) -> None:
+    """Draw true segments: arrows along thin centerlines, coloured by visibility, and light boundaries by type."""
     points, left, right, left_type, right_type, visibility = valid_rows(
         segments.valid,
         segments.points,
@@ -105,12 +100,11 @@ def draw_segments(
         segments.right_type,
         segments.visibility,
     )
-    colours = visibility_colours(visibility) if colour is None else colour
-    add_lines(ax, points, colours, width=0.7 * width, alpha=0.8 * alpha, zorder=3.0)
-    add_arrows(ax, points, colours, alpha=alpha, zorder=3.1)
-    sides = style.BOUNDARY if colour is None else colour
-    draw_boundaries(ax, left, left_type, sides, width=width, alpha=alpha, zorder=3.05)
-    draw_boundaries(ax, right, right_type, sides, width=width, alpha=alpha, zorder=3.05)
+    colours = visibility_colours(visibility)
+    add_lines(ax, points, colours, width=0.7, alpha=0.8, zorder=3.0)
+    add_arrows(ax, points, colours, zorder=3.1)
+    for line, types in ((left, left_type), (right, right_type)):
+        draw_boundaries(ax, line, types, style.BOUNDARY, width=1.0, zorder=3.05)
 
 
 def draw_boundaries(
@@ -120,7 +114,6 @@ def draw_boundaries(
     colours: str | Float[np.ndarray, "n 4"],
     *,
     width: float = 1.2,
-    alpha: float = 1.0,
     zorder: float = 3.5,
 ) -> None:
     """Draw boundaries of lanes by `LineType`: solid, dashed, or dotted and thin for none."""
@@ -131,7 +124,6 @@ def draw_boundaries(
             lines[mine],
             colours if isinstance(colours, str) else colours[mine],
             width=width * (_THIN if kind == LineType.NONE else 1.0),
-            alpha=alpha,
             zorder=zorder,
             dashes=dashes,
         )

@@ -10,8 +10,11 @@ from numpy.typing import ArrayLike
 
 from tflane_jax.scene import AreaType, Example, LineClass
 
+# A lane or line with a smaller visibility counts as out of sight.
+_HIDDEN_BELOW = 0.5
 
-def dataset_summary(arrays: Example, *, hidden_below: float = 0.5) -> list[dict[str, Any]]:
+
+def dataset_summary(arrays: Example) -> list[dict[str, Any]]:
     """Return rows for `format_table`: mean, minimum and maximum of each quantity over the examples, and its capacity.
 
     "full" is the fraction of examples that use every slot, so that something may have been left out. Quantities that
@@ -19,13 +22,12 @@ def dataset_summary(arrays: Example, *, hidden_below: float = 0.5) -> list[dict[
 
     Args:
         arrays: examples stacked along a leading axis.
-        hidden_below: a lane or line with a smaller visibility counts as out of sight.
     """
     lanes, areas, flow = arrays.lanes, arrays.areas, arrays.traffic_flow
     links = lanes.successor & lanes.valid[:, :, None] & lanes.valid[:, None]
     rows = [
         _slots("lanes", lanes.valid),
-        _subset("- out of sight", lanes.valid & (lanes.visibility < hidden_below)),
+        _subset("- out of sight", lanes.valid & (lanes.visibility < _HIDDEN_BELOW)),
         _subset("- in intersections", lanes.valid & lanes.is_connector),
         _row("- fraction in line of sight", _mean_of(lanes.visibility, lanes.valid)),
         _row("- topology links", links.sum((1, 2))),
@@ -38,7 +40,7 @@ def dataset_summary(arrays: Example, *, hidden_below: float = 0.5) -> list[dict[
         rows.append(_slots("map lines", lines.valid))
         rows += [_subset(f"- {kind.name.lower()}", lines.valid & (lines.category == kind)) for kind in LineClass]
         if lines.visibility is not None:
-            rows.append(_subset("- lines out of sight", lines.valid & (lines.visibility < hidden_below)))
+            rows.append(_subset("- lines out of sight", lines.valid & (lines.visibility < _HIDDEN_BELOW)))
     if flow is not None:
         known = flow.valid.any(-1)
         rows += [

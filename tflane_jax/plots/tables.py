@@ -42,13 +42,11 @@ def format_table(rows: Sequence[Row], columns: Sequence[str] | None = None, *, t
     return "\n".join([title, "", *lines] if title else lines)
 
 
-def latex_table(
-    rows: Sequence[Row], columns: Sequence[str] | None = None, *, caption: str = "", digits: int = 3
-) -> str:
-    """Return the rows as a LaTeX table for the package `booktabs`; cells and arguments as in `format_table`."""
-    names = list(columns) if columns is not None else list(dict.fromkeys(name for row in rows for name in row))
+def latex_table(rows: Sequence[Row], *, caption: str = "") -> str:
+    """Return the rows as a LaTeX table for the package `booktabs`; cells as in `format_table`."""
+    names = list(dict.fromkeys(name for row in rows for name in row))
     numeric = [all(row.get(name) is None or _is_number(row.get(name)) for row in rows) for name in names]
-    lines = [[_cell(row.get(name), digits).replace("\\|", "|") for name in names] for row in rows]
+    lines = [[_cell(row.get(name), 3).replace("\\|", "|") for name in names] for row in rows]
     body = [" & ".join(map(latex_text, line)) + r" \\" for line in (names, *lines)]
     return "\n".join(
         [

@@ -11,6 +11,7 @@ Host-side recordings in global coordinates (maps, poses, tracks) are in `tflane_
 from tflane_jax.scene.example import (
     Example,
     RoadImage,
+    row_of,
     shapes_of,
     stack_examples,
 )
@@ -72,6 +73,7 @@ __all__ = [
     "TrafficElements",
     "TrafficFlow",
     "VehicleState",
+    "row_of",
     "shapes_of",
     "stack_examples",
 ]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, TypeVar
 
 import chex
 import jax
@@ -14,6 +14,8 @@ from tflane_jax.scene.arrays import Array
 from tflane_jax.scene.priors import MarkerObservations, SdMap, TrafficFlow
 from tflane_jax.scene.truth import Areas, LaneGraph, LaneLines, MapLines, TrafficElements
 from tflane_jax.scene.views import CameraViews
+
+TreeT = TypeVar("TreeT")
 
 
 @struct.dataclass
@@ -97,6 +99,11 @@ class RoadImage:
 def stack_examples(examples: list[Any]) -> Any:
     """Stack pytrees of equal structure into one batch with a leading axis (numpy, host)."""
     return jax.tree.map(lambda *leaves: np.stack(leaves), *examples)
+
+
+def row_of(stacked: TreeT, index: int) -> TreeT:
+    """Return one example of a batch, or one row of any pytree with a leading axis, as arrays (numpy, host)."""
+    return jax.tree.map(lambda leaf: np.asarray(leaf[index]), stacked)
 
 
 def shapes_of(example: Any, *leading: int) -> Any:

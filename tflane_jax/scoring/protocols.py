@@ -39,7 +39,7 @@ class ScoringProtocol:
             are by group.
         remarks: returns what is unusual, though not wrong, about predictions and truth.
         found: that one of the numbers which is 0 exactly if no predicted line is near a true one; "" for none.
-        frame: axes, units and frame of the lines, for a remark.
+        frame: axes, units and frame of the lines, or what else to look at, for a remark where none is near.
         no_scenes: why `scene_of` separates frames of one drive; "" if it does not.
     """
 
@@ -123,9 +123,9 @@ def _maptr(sampling: Sampling, measure: Measure = "chamfer", dims: Dims = 2) -> 
         metrics=partial(VectorMapMetrics, sampling, measure, dims),
         columns=("mAP", *(f"AP_{name}" for name in LINE_CLASSES)),
         formats=("MapTR",),
-        remarks=remarks.map_lines,
+        remarks=remarks.units,
         found="mAP",
-        frame="metres in the frame of the sensor or vehicle that the ground truth uses",
+        frame="and are the classes right",
         groups={"occlusion": grouped, "distance": partial(grouped, partition=ByDistance())},
     )
 
@@ -153,7 +153,7 @@ PROTOCOLS: dict[str, ScoringProtocol] = {
         metrics=CenterlineFScore,
         columns=("F_score", "F_recall", "F_precision"),
         groups={},
-        remarks=remarks.centerline_units,
+        remarks=remarks.units,
         found="F_recall",
     ),
     "maptr": _maptr("maptr"),

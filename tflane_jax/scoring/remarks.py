@@ -31,12 +31,15 @@ def centerlines(predictions: Mapping[Any, LaneDetections], truth: Mapping[Any, L
     return [
         *_other_counts("predicted centerlines", _lines(predictions, lambda one: one.points), CENTERLINE_POINTS),
         *_other_counts("true centerlines", _lines(truth, lambda one: one.points), CENTERLINE_POINTS),
-        *centerline_units(predictions, truth),
+        *units(predictions, truth),
     ]
 
 
-def centerline_units(predictions: Mapping[Any, LaneDetections], truth: Mapping[Any, LaneTruth]) -> list[str]:
-    """Return a remark where centerlines seem to be of other units."""
+def units(
+    predictions: Mapping[Any, LaneDetections] | Mapping[Any, MapDetections],
+    truth: Mapping[Any, LaneTruth] | Mapping[Any, MapTruth],
+) -> list[str]:
+    """Return a remark where centerlines or lines of a map seem to be of other units."""
     return _units(_lines(predictions, lambda one: one.points), _lines(truth, lambda one: one.points))
 
 
@@ -53,11 +56,6 @@ def segments(predictions: Mapping[Any, SegmentDetections], truth: Mapping[Any, S
     return [*(remark for remarks in counts for remark in remarks), *areas, *units]
 
 
-def map_lines(predictions: Mapping[Any, MapDetections], truth: Mapping[Any, MapTruth]) -> list[str]:
-    """Return a remark where lines seem to be of other units."""
-    return _units(_lines(predictions, lambda one: one.points), _lines(truth, lambda one: one.points))
-
-
 def images(predictions: Mapping[Any, RowLanes], truth: Mapping[Any, RowLanes], time_limit: float) -> list[str]:
     """Return remarks on images that took longer than the limit (milliseconds), and on labels at other rows."""
     return [*_slow(predictions, time_limit), *_other_rows(truth)]
@@ -71,7 +69,7 @@ def nothing_near(
     Args:
         predictions, truth: by frame; lanes, segments or lines of a map.
         score: one over all frames that is 0 exactly if no line is found.
-        frame: axes, units and frame of the lines, in words.
+        frame: axes, units and frame of the lines, or what else to look at, in words.
     """
     both = [any(len(getattr(one, "lanes", one).points) for one in side.values()) for side in (predictions, truth)]
     if score != 0.0 or not all(both):

@@ -15,6 +15,9 @@ import numpy as np
 from tflane_jax.errors import UserError
 from tflane_jax.progress import progress_bar
 
+_LEVEL = 0.95
+_TAILS = (1 - _LEVEL) / 2, (1 + _LEVEL) / 2
+
 
 class Accumulator(Protocol):
     """The interface of every metric of `tflane_jax.metrics`."""
@@ -56,10 +59,8 @@ class Scored:
         """Return the numbers of each scene."""
         return {name: metrics.compute() for name, metrics in self.scenes.items()}
 
-    def intervals(
-        self, samples: int, *, level: float = 0.95, seed: int = 0, progress: bool = True
-    ) -> dict[str, tuple[float, float]]:
-        """Return percentile bootstrap intervals of the numbers: scenes are drawn with replacement, `samples` times.
+    def intervals(self, samples: int, *, progress: bool = True) -> dict[str, tuple[float, float]]:
+        """Return 95 % percentile bootstrap intervals of the numbers: scenes are drawn with replacement `samples` times.
 
         A number that some samples do not have, such as an error of matched lanes where none is matched, has none.
 
@@ -67,15 +68,14 @@ class Scored:
         """
         scenes = list(self.scenes.values())
         check_bootstrap(len(scenes))
-        rng = np.random.default_rng(seed)
+        rng = np.random.default_rng(0)
         drawn: dict[str, list[float]] = {}
         for _ in progress_bar(range(samples), desc="bootstrap", unit="sample", disable=not progress):
             chosen = [scenes[i] for i in rng.integers(0, len(scenes), len(scenes))]
             for name, value in _merged(chosen).compute().items():
                 drawn.setdefault(name, []).append(value)
-        tails = (1 - level) / 2, (1 + level) / 2
         whole = {name: values for name, values in drawn.items() if len(values) == samples}
-        return {name: tuple(np.quantile(values, tails).tolist()) for name, values in whole.items()}
+        return {name: tuple(np.quantile(values, _TAILS).tolist()) for name, values in whole.items()}
 
 
 def score(

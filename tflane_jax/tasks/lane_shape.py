@@ -244,11 +244,12 @@ def predict_curves(
     return answer.curves
 
 
-def frames_per_second(task: Predictor, params: Params, height: int = INPUT_HEIGHT, width: int = INPUT_WIDTH) -> float:
+def frames_per_second(task: Predictor, params: Params) -> float:
     """Return the images per second at batch size 1, from uint8 image to curves, without compilation (median)."""
-    image = np.random.default_rng(0).integers(0, 256, (1, height, width, 3), np.uint8)
+    size = (1, INPUT_HEIGHT, INPUT_WIDTH)
+    image = np.random.default_rng(0).integers(0, 256, (*size, 3), np.uint8)
     lines = jax.tree.map(lambda leaf: leaf[None], LaneLines.empty(1, 1))
-    batch = jax.device_put(RoadImage(image, np.ones((1, height, width), bool), lines))
+    batch = jax.device_put(RoadImage(image, np.ones(size, bool), lines))
     params, seconds = jax.device_put(params), []
     for _ in range(_TIMED_FRAMES):
         began = time.perf_counter()

@@ -21,7 +21,7 @@ from tflane_jax.evaluation.predict import Predictor
 from tflane_jax.files.images import opencv
 from tflane_jax.geometry.lane_shapes import curve_columns
 from tflane_jax.models.parameters import Params
-from tflane_jax.scene import LaneLines, RoadImage
+from tflane_jax.scene import LaneLines, RoadImage, row_of
 from tflane_jax.tasks.lane_shape import predict_curves
 
 # Rows of the horizon that are tried, as fractions of a photo's height, and widths of the view, of the photo's width.
@@ -155,7 +155,7 @@ class PhotoReader:
         fitted = fit_photo(photo, view)
         example = RoadImage(fitted.image, fitted.image_valid, LaneLines.empty(1, 1))
         stacked = jax.tree.map(lambda leaf: np.asarray(leaf)[None], example)
-        answer = jax.tree.map(lambda leaf: leaf[0], predict_curves(self.task, self.params, stacked))
+        answer = row_of(predict_curves(self.task, self.params, stacked), 0)
         scores = lane_scores(answer)
         curves = np.asarray(answer.curves, np.float64)
         # A lane that would end above its beginning has no points, as in TuSimple's metric.

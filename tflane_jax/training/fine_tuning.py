@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import jax
-from flax.traverse_util import flatten_dict, unflatten_dict
+from flax.traverse_util import unflatten_dict
 
 from tflane_jax.errors import UserError
 from tflane_jax.migrations import migrate
 from tflane_jax.models.parameters import Params
 from tflane_jax.startup import write
+from tflane_jax.training.array_files import flat
 from tflane_jax.training.checkpoint import Checkpoints
 from tflane_jax.training.run_folder import read_config
 from tflane_jax.training.state import TrainState, per_seed
@@ -82,7 +83,7 @@ def _starting_checkpoint(folder: Path) -> tuple[Checkpoints, int, list[int]]:
 def _params_of_run(folder: Path, fresh: Params, *, partly: bool, frozen: Sequence[str]) -> Params:
     checkpoints, step, seeds = _starting_checkpoint(folder)
     params = checkpoints.params(step)
-    saved, wanted = (_flat(tree) for tree in (per_seed(params, seeds)[0], fresh))
+    saved, wanted = (flat(tree) for tree in (per_seed(params, seeds)[0], fresh))
     for name in sorted(saved.keys() & wanted.keys()):
         if _shape(saved[name]) != _shape(wanted[name]):
             raise UserError(
@@ -107,10 +108,6 @@ def _params_of_run(folder: Path, fresh: Params, *, partly: bool, frozen: Sequenc
         if names:
             write(f"from {folder}: {_modules(names)} {what}")
     return unflatten_dict({name: saved.get(name, value) for name, value in wanted.items()}, sep="/")
-
-
-def _flat(params: Mapping[str, Any]) -> dict[str, jax.Array]:
-    return flatten_dict(params, sep="/")  # pyright: ignore[reportReturnType]
 
 
 def _shape(leaf: jax.Array) -> tuple[tuple[int, ...], str]:

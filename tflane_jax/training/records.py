@@ -175,7 +175,7 @@ class Window:
 
     def record(self, step: int) -> Record:
         means = {name: np.divide(values, self.steps).tolist() for name, values in self.sums.items()}
-        return {"step": step, "split": "train"} | {k: v[0] if len(v) == 1 else v for k, v in means.items()}
+        return seed_record(step, "train", means)
 
 
 def seed_record(step: int, split: str, values: dict[str, list[float]]) -> Record:

@@ -15,7 +15,7 @@ from jax import lax
 from jax.sharding import Mesh
 
 from tflane_jax.devices import everywhere, in_parts, replicated, spread
-from tflane_jax.training.vectors import Vectors
+from tflane_jax.training.vectors import Vectors, is_vectors
 
 
 def placed(state: Any, mesh: Mesh | None, *, shard: bool) -> Any:
@@ -31,23 +31,23 @@ def placed(state: Any, mesh: Mesh | None, *, shard: bool) -> Any:
         return replicated(state, mesh)
 
     def place(node: Any) -> Any:
-        if not _is_vectors(node):
+        if not is_vectors(node):
             return replicated(node, mesh)
         return jax.tree.map(lambda vector: spread(vector, mesh), node.padded(mesh.size))
 
-    return jax.tree.map(place, state, is_leaf=_is_vectors)
+    return jax.tree.map(place, state, is_leaf=is_vectors)
 
 
 def laid_out(state: Any, mesh: Mesh, *, shard: bool) -> Any:
     """Return shapes and shardings of a state, given by its shapes, as `placed` puts it on the devices."""
 
     def shapes(node: Any) -> Any:
-        divided = shard and _is_vectors(node)
+        divided = shard and is_vectors(node)
         node = jax.eval_shape(lambda vectors: vectors.padded(mesh.size), node) if divided else node
         where = in_parts(mesh) if divided else everywhere(mesh)
         return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=where), node)
 
-    return jax.tree.map(shapes, state, is_leaf=_is_vectors)
+    return jax.tree.map(shapes, state, is_leaf=is_vectors)
 
 
 @dataclass(frozen=True)
@@ -70,10 +70,6 @@ class Division:
             return tree
 
         def put(node: Any) -> Any:
-            return lax.with_sharding_constraint(node, in_parts(mesh) if _is_vectors(node) else everywhere(mesh))
+            return lax.with_sharding_constraint(node, in_parts(mesh) if is_vectors(node) else everywhere(mesh))
 
-        return jax.tree.map(put, tree, is_leaf=_is_vectors)
-
-
-def _is_vectors(node: Any) -> bool:
-    return isinstance(node, Vectors)
+        return jax.tree.map(put, tree, is_leaf=is_vectors)

@@ -16,7 +16,7 @@ from tflane_jax.models.parameters import Params, split_statistics
 from tflane_jax.startup import in_another_thread
 from tflane_jax.training.rng import stream
 from tflane_jax.training.task import Trainable
-from tflane_jax.training.vectors import Vectors, layout_of, ravel
+from tflane_jax.training.vectors import Vectors, is_vectors, layout_of, ravel
 
 
 @struct.dataclass
@@ -116,7 +116,7 @@ def tree_of(state: TrainState) -> dict[str, Any]:
         "params": state.learned.tree() | state.statistics,
         "ema_params": state.ema_learned.tree() | state.ema_statistics,
         "opt_state": jax.tree.map(
-            lambda node: node.tree() if _is_vectors(node) else node, state.opt_state, is_leaf=_is_vectors
+            lambda node: node.tree() if is_vectors(node) else node, state.opt_state, is_leaf=is_vectors
         ),
         "key": state.key,
     }
@@ -133,14 +133,10 @@ def state_from(trees: dict[str, Any], like: TrainState) -> TrainState:
         ema_learned=ravel(ema_learned, like.learned.layout),
         ema_statistics=ema_statistics,
         opt_state=jax.tree.map(
-            lambda node, part: ravel(part, node.layout) if _is_vectors(node) else part,
+            lambda node, part: ravel(part, node.layout) if is_vectors(node) else part,
             like.opt_state,
             trees["opt_state"],
-            is_leaf=_is_vectors,
+            is_leaf=is_vectors,
         ),
         key=trees["key"],
     )
-
-
-def _is_vectors(node: Any) -> bool:
-    return isinstance(node, Vectors)

@@ -1,4 +1,4 @@
-"""Learned parameters as a few long vectors, each of which one fused operation updates.
+"""Learned parameters as a few long vectors, each updated by one fused operation.
 
 A small model has 300 leaves. Guard, clipping, moments, decay and average of every leaf apart are thousands of
 operations that take a third of a step; on vectors they are a few dozen. Users and checkpoints see trees.
@@ -204,3 +204,8 @@ def any_in_leaf(vector: Bool[Array, " n"], layout: Layout, group: str) -> Bool[A
         rows.astype(jnp.int32), leaf_of_row, num_segments=len(members), indices_are_sorted=True
     )
     return jnp.broadcast_to((leaves > 0)[leaf_of_row, None], (len(rows), ROW)).reshape(-1)
+
+
+def is_vectors(node: Any) -> bool:
+    """Return whether a node of a tree is `Vectors`."""
+    return isinstance(node, Vectors)

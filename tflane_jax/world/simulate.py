@@ -29,7 +29,7 @@ from tflane_jax.world.roads.road_map import RoadMap, drives_on_left
 from tflane_jax.world.terrain import TerrainConfig, on_terrain
 from tflane_jax.world.traffic.signals import element_states, show_signals
 from tflane_jax.world.traffic.simulation import EGO_JOINS, Traffic, TrafficConfig, simulate_traffic
-from tflane_jax.world.traffic.tracker import TrackerConfig, track, wrap_angle
+from tflane_jax.world.traffic.tracker import TrackerConfig, track, wrap_outside
 from tflane_jax.world.view import turned_view
 from tflane_jax.world.warp import Warp, WarpConfig, warped, warped_map
 
@@ -341,7 +341,7 @@ def _in_ego_frames(traffic: Traffic) -> Tracks:
     position[~traffic.present] = 0.0
     return Tracks(
         position=position,
-        yaw=np.where(traffic.present, wrap_angle(traffic.yaw - heading[:, None]), 0.0),
+        yaw=np.where(traffic.present, wrap_outside(traffic.yaw - heading[:, None]), 0.0),
         size=traffic.size,
         category=traffic.category,
         occluded=np.zeros(traffic.present.shape, bool),

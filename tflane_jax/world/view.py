@@ -14,7 +14,7 @@ from jaxtyping import Float
 from tflane_jax.geometry import transform_points, yaw_pose
 from tflane_jax.scene.logs import Log, Tracks
 from tflane_jax.world.moving import moved_boxes
-from tflane_jax.world.traffic.tracker import wrap_angle
+from tflane_jax.world.traffic.tracker import wrap_outside
 
 
 def turned_view(log: Log, turn: float) -> Log:
@@ -43,5 +43,5 @@ def _tracks(found: Tracks, turn: float) -> Tracks:
     return replace(
         found,
         position=transform_points(back, found.position),
-        yaw=np.where(found.valid, wrap_angle(found.yaw - turn), found.yaw),
+        yaw=np.where(found.valid, wrap_outside(found.yaw - turn), found.yaw),
     )

@@ -18,7 +18,7 @@ from tflane_jax.geometry import invert_pose, pose_yaw, transform_points, yaw_pos
 from tflane_jax.limits import ASCENDING, Count, Fraction, Positive, Rules
 from tflane_jax.scene.logs import Log, Tracks, VectorMap
 from tflane_jax.world.moving import moved_boxes, moved_map, with_vertices
-from tflane_jax.world.traffic.tracker import wrap_angle
+from tflane_jax.world.traffic.tracker import wrap_outside
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,7 +147,7 @@ def _tracks(found: Tracks, poses: np.ndarray, there: np.ndarray, warp: Warp) -> 
     return replace(
         found,
         position=np.where(found.valid[..., None], position, found.position),
-        yaw=np.where(found.valid, wrap_angle(yaw), found.yaw),
+        yaw=np.where(found.valid, wrap_outside(yaw), found.yaw),
     )
 
 

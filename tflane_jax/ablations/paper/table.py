@@ -174,8 +174,9 @@ def longer(config: RunConfig, factor: int) -> RunConfig:
     return replace(config, training=training, optim=optim)
 
 
-def shortened(config: RunConfig, steps: int = 8) -> RunConfig:
+def shortened(config: RunConfig) -> RunConfig:
     """Return a smoke test of the configuration: few updates on few data, and one decoder layer, to compile sooner."""
+    steps = 8
     often = {"eval_every": steps, "checkpoint_every": steps, "log_every": steps // 2}
     training = replace(config.training, steps=steps, **often)
     optim = replace(config.optim, warmup_steps=min(config.optim.warmup_steps, steps // 4))

@@ -10,9 +10,7 @@ from __future__ import annotations
 
 from tflane_jax.ablations.declaration import Claim
 from tflane_jax.ablations.paper.table import PaperTable, Quoted, TableRow
-
-WITHOUT = "no traffic flow at inference"
-"""Name of the intervention, see `tasks.Task.interventions`."""
+from tflane_jax.evaluation.interventions import NO_TRAFFIC
 
 _OPENLANE = "OpenLane-V2 subset A, validation split; 60 epochs, * best epoch of the baseline and of ours"
 _NUSCENES = "nuScenes, validation split, Chamfer AP in percent; 60 epochs, * best epoch"
@@ -255,12 +253,12 @@ TABLES = (
         ),
         (
             Claim(
-                f"LaneSegNet + TFM, {WITHOUT}",
+                f"LaneSegNet + TFM, {NO_TRAFFIC}",
                 "LaneSegNet",
                 "a model trained with traffic flow is better than the baseline even without it (+1.33 mAP)",
             ),
-            Claim(f"LaneSegNet + TFM, {WITHOUT}", "LaneSegNet + TFM, control", "and the traffic in training is why"),
-            Claim("LaneSegNet + TFM", f"LaneSegNet + TFM, {WITHOUT}", "traffic flow at inference helps (+0.70 mAP)"),
+            Claim(f"LaneSegNet + TFM, {NO_TRAFFIC}", "LaneSegNet + TFM, control", "and the traffic in training is why"),
+            Claim("LaneSegNet + TFM", f"LaneSegNet + TFM, {NO_TRAFFIC}", "traffic flow at inference helps (+0.70 mAP)"),
         ),
         _quoted(
             _LANESEGNET,
@@ -268,7 +266,7 @@ TABLES = (
             **{
                 "LaneSegNet": ("-", "-", *_BASELINE),
                 "LaneSegNet + TFM": (30, 30, *_BEST),
-                f"LaneSegNet + TFM, {WITHOUT}": (30, 0, 34.32, 33.54, 35.10, 27.82),
+                f"LaneSegNet + TFM, {NO_TRAFFIC}": (30, 0, 34.32, 33.54, 35.10, 27.82),
             },
         ),
         minutes=7.5,

@@ -72,7 +72,7 @@ def evaluate(commands) -> None:
     parser.add_argument(
         "--errors",
         action="store_true",
-        help="also count the lanes that are found with other ends, in part, or not at all, and the same of detections",
+        help="also count lanes found with a wrong extent, in part, or not at all, and the same of detections",
     )
     parser.add_argument(
         "--training-root",
@@ -194,7 +194,7 @@ def summary(commands) -> None:
     parser.add_argument(
         "--plan", metavar="DEVICES", type=int, help="estimate memory and time of the training on so many accelerators"
     )
-    kinds = ["a100", "h100", "h200", "rtx3090", "rtx4090"]  # of plan.KINDS
+    kinds = ["a100", "h100", "h200", "rtx3090", "rtx4090"]  # of plan.ACCELERATORS
     parser.add_argument("--kind", choices=kinds, help="with --plan: kind of the accelerators (default h100)")
     parser.add_argument(
         "--utilisation", type=float, help="with --plan: fraction of the peak that is assumed (default 0.25)"

@@ -11,6 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from tflane_jax.geometry import wrap_angle
+
 # Widens each angular interval of the prefilter so that rounding never drops a pair; the exact test decides.
 _ANGLE_MARGIN = 1e-9
 # Replaces a zero component of a ray direction: far smaller than any real one, and its inverse is finite.
@@ -81,6 +83,17 @@ def hidden_points(
     return hidden
 
 
+def occluders_from(boxes: Float[np.ndarray, "k 7"], eye: Float[np.ndarray, "_"]) -> Float[np.ndarray, "k 7"]:
+    """Return boxes as `hidden_points` takes them, with x and y relative to those of an eye.
+
+    Args:
+        boxes: rows x, y, length, width, yaw, low z, high z.
+        eye: x, y (and z, which is not used).
+    """
+    x, y, length, width, yaw, low, high = boxes.T
+    return np.stack([x - eye[0], y - eye[1], length, width, yaw, high - low, low], -1)
+
+
 def _occluders(boxes: np.ndarray, buildings: np.ndarray) -> Float[np.ndarray, "o 7"]:
     """Return boxes then buildings as rows x, y, length, width, yaw, low z, high z."""
     boxes = np.asarray(boxes, np.float64).reshape(-1, 7)
@@ -112,8 +125,8 @@ def _pairs_in_angle(points: Directions, occluders: np.ndarray) -> tuple[np.ndarr
     )
     middle = np.arctan2(y, x)
     offset = np.arctan2(corners[..., 1], corners[..., 0]) - middle[:, None]
-    offset = (offset + np.pi) % (2 * np.pi) - np.pi
-    low = (middle + offset.min(-1) - _ANGLE_MARGIN + np.pi) % (2 * np.pi) - np.pi
+    offset = wrap_angle(offset)
+    low = wrap_angle(middle + offset.min(-1) - _ANGLE_MARGIN)
     span = offset.max(-1) - offset.min(-1) + 2 * _ANGLE_MARGIN
 
     first = np.searchsorted(points.angle, low, side="left")

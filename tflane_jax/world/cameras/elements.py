@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 
 from tflane_jax.geometry import invert_pose
 from tflane_jax.scene.logs import MapElement
-from tflane_jax.world.bev.line_of_sight import hidden_points
+from tflane_jax.world.bev.line_of_sight import hidden_points, occluders_from
 from tflane_jax.world.cameras.solids import Bodies, Box, pack
 from tflane_jax.world.render.camera import NEAR, FrontCamera
 from tflane_jax.world.render.polygons import Solid
@@ -175,11 +175,9 @@ def unhidden(
         corners[:, None, 0] + fraction[:, :1] * across[:, None] + fraction[:, 1:] * up[:, None] + 0.03 * faces[:, None]
     )
     eye = invert_pose(camera.camera_from_ego)[:3, 3]
-    x, y, length, width, yaw, low, high = boxes.T
-    occluders = np.stack([x - eye[0], y - eye[1], length, width, yaw, high - low, low], -1)
     hidden = hidden_points(
         points.reshape(-1, 3)[:, :2] - eye[:2],
-        occluders,
+        occluders_from(boxes, eye),
         np.zeros((0, 5)),
         sensor_height=float(eye[2]),
         target_height=points[..., 2].ravel(),

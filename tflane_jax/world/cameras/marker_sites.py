@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from tflane_jax.scene.logs import VectorMap
-from tflane_jax.world.bev.line_of_sight import hidden_points
+from tflane_jax.world.bev.line_of_sight import hidden_points, occluders_from
 from tflane_jax.world.cameras.stage import map_boxes
 from tflane_jax.world.roads.markers import Visible
 
@@ -34,17 +34,15 @@ def visible_places(vector_map: VectorMap, seed: int, size: float = 1.0, *, on_le
     def visible(place: Float[np.ndarray, "3"], heading: float) -> float:
         along, left = np.array([np.cos(heading), np.sin(heading)]), np.array([-np.sin(heading), np.cos(heading)])
         near = boxes[np.hypot(*(boxes[:, :2] - place[:2]).T) < reach + 0.5 * np.hypot(boxes[:, 2], boxes[:, 3])]
-        x, y, length, width, yaw, low, high = near.T
         across, up = (size * axis.ravel() for axis in np.meshgrid(_ACROSS, _ACROSS))
         points = place[:2] + across[:, None] * left
         hidden = []
         for ahead, aside in VIEWS:
             eye = place[:2] - ahead * along + towards_road * aside * left
-            occluders = np.stack([x - eye[0], y - eye[1], length, width, yaw, high - low, low], -1)
             hidden.append(
                 hidden_points(
                     points - eye,
-                    occluders,
+                    occluders_from(near, eye),
                     np.zeros((0, 5)),
                     sensor_height=_EYE,
                     target_height=place[2] + up,

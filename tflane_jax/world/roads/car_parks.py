@@ -8,8 +8,9 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
+from tflane_jax.geometry import wrap_angle
 from tflane_jax.world.roads.config import RoadConfig
-from tflane_jax.world.roads.curves import arc_length, cross, direction, points_at, right_of, wrap
+from tflane_jax.world.roads.curves import arc_length, cross, direction, points_at, right_of
 from tflane_jax.world.roads.site import Site
 
 # Number of places in a row, their width, and the distance of their middles from the kerb, metres.
@@ -48,7 +49,7 @@ def draw_car_parks(rng: np.random.Generator, site: Site, config: RoadConfig) -> 
     places = places[free]
     # Rows behind two kerbs of one corner may meet.
     close = np.linalg.norm(places[:, None, :2] - places[None, :, :2], axis=-1) < 2.0 * _WIDTH
-    other = np.abs(wrap(2.0 * (places[:, None, 2] - places[None, :, 2]))) > 1e-6
+    other = np.abs(wrap_angle(2.0 * (places[:, None, 2] - places[None, :, 2]))) > 1e-6
     return places[~np.triu(close & other, 1).any(0)]
 
 
@@ -64,7 +65,7 @@ def _rows(rng: np.random.Generator, kerb: Float[np.ndarray, "n 2"], density: flo
         a, b = points_at(kerb, np.array([start, start + number * _WIDTH]))
         heading = float(np.arctan2(*(b - a)[::-1]))
         along = (np.arange(number)[:, None] + 0.5) * _WIDTH * direction(heading)
-        yaw = wrap(heading - 0.5 * np.pi + np.pi * turned)
+        yaw = wrap_angle(heading - 0.5 * np.pi + np.pi * turned)
         found.append(np.concatenate([a + along + behind * right_of(heading), yaw[:, None]], -1))
         last = start + number * _WIDTH
     return np.concatenate(found)

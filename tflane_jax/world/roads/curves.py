@@ -10,6 +10,11 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Float
 
+from tflane_jax.geometry import wrap_angle
+
+# Greatest distance between points of a rounded corner, metres.
+_FILLET_SPACING = 0.8
+
 
 def direction(heading: Float[np.ndarray, "*b"] | float) -> Float[np.ndarray, "*b 2"]:
     """Return the unit vector of a heading (radians)."""
@@ -21,14 +26,9 @@ def right_of(heading: Float[np.ndarray, "*b"] | float) -> Float[np.ndarray, "*b 
     return np.stack([np.sin(heading), -np.cos(heading)], -1)
 
 
-def cross(a: Float[np.ndarray, "*b 2"], b: Float[np.ndarray, "*b 2"]) -> Float[np.ndarray, "*b"]:
+def cross(a: Float[np.ndarray, "*#b 2"], b: Float[np.ndarray, "*#b 2"]) -> Float[np.ndarray, "*#b"]:
     """Return the z component of the cross product of plane vectors."""
     return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
-
-
-def wrap(angle: Float[np.ndarray, "*b"] | float) -> Float[np.ndarray, "*b"]:
-    """Return the angle in [-pi, pi)."""
-    return (np.asarray(angle) + np.pi) % (2 * np.pi) - np.pi
 
 
 def smoothstep(u: Float[np.ndarray, "*b"]) -> Float[np.ndarray, "*b"]:
@@ -110,7 +110,7 @@ def clothoid_line(
 
 
 def fillet(
-    corner: Float[np.ndarray, "2"], heading_a: float, heading_b: float, radius: float, spacing: float = 0.8
+    corner: Float[np.ndarray, "2"], heading_a: float, heading_b: float, radius: float
 ) -> Float[np.ndarray, "n 2"]:
     """Return the arc that rounds the corner between two rays, from the ray `heading_a` to the ray `heading_b`.
 
@@ -123,7 +123,7 @@ def fillet(
     start = corner + a * radius / np.tan(gap / 2) - center
     first = np.arctan2(start[1], start[0])
     sweep = np.copysign(np.pi - gap, cross(b, a))
-    angles = first + np.linspace(0.0, sweep, max(int(np.ceil(radius * abs(sweep) / spacing)), 2) + 1)
+    angles = first + np.linspace(0.0, sweep, max(int(np.ceil(radius * abs(sweep) / _FILLET_SPACING)), 2) + 1)
     return center + radius * direction(angles)
 
 
@@ -150,7 +150,7 @@ def blend(
             it leaves the straight line later and crosses over more steeply.
     """
     u, v, d = direction(start_heading), direction(stop_heading), stop - start
-    turn = np.abs(wrap(stop_heading - start_heading))
+    turn = np.abs(wrap_angle(stop_heading - start_heading))
     distance = np.linalg.norm(d, axis=-1)
     sine = cross(u, v)
     safe = np.where(np.abs(sine) > 1e-9, sine, 1.0)
@@ -182,6 +182,11 @@ def arc_length(points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
     """Return the distance along the line to each point, metres."""
     steps = np.diff(points, axis=0)
     return np.concatenate([[0.0], np.cumsum(np.hypot(steps[:, 0], steps[:, 1]))])
+
+
+def line_length(line: Float[np.ndarray, "n d"]) -> float:
+    """Return the length of a line in the ground plane, metres."""
+    return float(np.linalg.norm(np.diff(line[:, :2], axis=0), axis=-1).sum())
 
 
 def points_at(line: Float[np.ndarray, "n 2"], distances: Float[np.ndarray, " k"]) -> Float[np.ndarray, "k 2"]:

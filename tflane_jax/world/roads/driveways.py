@@ -11,8 +11,9 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool, Float
 
+from tflane_jax.geometry import wrap_angle
 from tflane_jax.world.roads.config import RoadConfig
-from tflane_jax.world.roads.curves import arc_length, direction, fillet, points_at, right_of, wrap
+from tflane_jax.world.roads.curves import arc_length, direction, fillet, points_at, right_of
 from tflane_jax.world.roads.layouts import chance, draw
 from tflane_jax.world.roads.site import Driveway, Site
 
@@ -63,7 +64,7 @@ def draw_driveways(
                 continue
             at = points_at(kerb, np.array([start, middle, stop]))
             steps = np.diff(at, axis=0)
-            turn = wrap(np.arctan2(steps[1, 1], steps[1, 0]) - np.arctan2(steps[0, 1], steps[0, 0]))
+            turn = wrap_angle(np.arctan2(steps[1, 1], steps[1, 0]) - np.arctan2(steps[0, 1], steps[0, 0]))
             heading = float(np.arctan2(*(at[2] - at[0])[::-1]))
             ahead, outward = direction(heading), right_of(heading)
             half = 0.5 * width * ahead
@@ -91,7 +92,7 @@ def draw_driveways(
                 if access:
                     # On the lane out, or the lane in.
                     xy = xy + (0.5 if leaves or out else -0.5) * half
-                yaw = wrap(heading - np.pi / 2 + np.pi * (leaves or out))
+                yaw = wrap_angle(heading - np.pi / 2 + np.pi * (leaves or out))
                 slot = np.array([*xy, yaw])
                 lanes = {"lanes": width, "rounding": rounding} if access else {}
                 found.append(Driveway(number, start, stop, edge, slot, **lanes))

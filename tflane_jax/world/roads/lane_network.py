@@ -95,10 +95,10 @@ class LaneNetwork:
         """Make traffic on `segment` wait for traffic on `others`."""
         self.yield_to.setdefault(segment, set()).update(others)
 
-    def start_of(self, segment: int, vehicle_heading: float, pocket: int = 0) -> LaneEnd:
+    def start_of(self, segment: int, vehicle_heading: float) -> LaneEnd:
         """Return the cross-section at which a segment starts."""
         draft = self.drafts[segment]
-        return LaneEnd(segment, draft.left[0], draft.right[0], vehicle_heading, draft.vehicle, pocket)
+        return LaneEnd(segment, draft.left[0], draft.right[0], vehicle_heading, draft.vehicle)
 
     def end_of(self, segment: int, vehicle_heading: float, pocket: int = 0) -> LaneEnd:
         """Return the cross-section at which a segment ends."""

@@ -12,8 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
+from tflane_jax.geometry import wrap_angle
 from tflane_jax.scene.logs import LaneSegment, MapElement
-from tflane_jax.world.roads.curves import arc_length, direction, points_at, wrap
+from tflane_jax.world.roads.curves import arc_length, direction, points_at
 from tflane_jax.world.roads.movements import LEFT, RIGHT, STRAIGHT, THROUGH
 from tflane_jax.world.roads.right_of_way import lines_meet, phases_of
 from tflane_jax.world.roads.traffic_control import GREEN, LIGHT, LIGHT_HEIGHT, RED
@@ -166,7 +167,7 @@ def _junction(
         known = [i for i in left if any(j in arm for j in before[i])] or left[:1]
         arm |= {i: next((arm[j] for j in before[i] if j in arm), 0) for i in known}
         left = [i for i in left if i not in arm]
-    turn = {i: _turn(float(wrap(ends[i] - starts[i]))) for i in members}
+    turn = {i: _turn(float(wrap_angle(ends[i] - starts[i]))) for i in members}
     lines = [_evenly(lanes[i].centerline[:, :2]) for i in members]
     arms = [arm[i] for i in members]
     incoming = [
@@ -204,7 +205,7 @@ def _arms(
         same = [
             k
             for k, j in enumerate(first)
-            if abs(float(wrap(starts[i] - starts[j]))) < _SAME_WAY
+            if abs(float(wrap_angle(starts[i] - starts[j]))) < _SAME_WAY
             and np.linalg.norm(here - lanes[j].centerline[0, :2]) < _ARM
         ]
         if not same:
@@ -225,7 +226,7 @@ def _minor(heading: Sequence[float], through: Sequence[int]) -> tuple[bool, ...]
         (through[i] + through[j], i, j)
         for i in range(len(heading))
         for j in range(i + 1, len(heading))
-        if abs(float(wrap(heading[i] - heading[j] + np.pi))) < STRAIGHT
+        if abs(float(wrap_angle(heading[i] - heading[j] + np.pi))) < STRAIGHT
     ]
     major = {int(np.argmax(through))} if not pairs else set(max(pairs, key=lambda pair: (pair[0], -pair[1]))[1:])
     return tuple(k not in major for k in range(len(heading)))

@@ -13,9 +13,10 @@ from typing import Annotated, Literal
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from tflane_jax.geometry import pose_matrix
+from tflane_jax.geometry import pose_matrix, segment_distances, wrap_angle
 from tflane_jax.limits import Positive, PositiveOrZero, within
 from tflane_jax.scene.logs import LaneSegment, PlacedMarkers, VectorMap
+from tflane_jax.world.roads.curves import cross, line_length
 
 ROOT = 20_251_122
 # Two lane ends are side by side within these limits: along and across the road (metres) and in heading.
@@ -191,7 +192,7 @@ def _most_visible(
                 continue
             others = _places([sites[i] for i in waiting], away, setback, vector_map, config)
             for i, there, angle, free in zip(waiting.tolist(), *others, strict=True):
-                long_enough = _length(sites[i][0].right) > away + _CLEAR
+                long_enough = line_length(sites[i][0].right) > away + _CLEAR
                 seen = visible(there, float(angle)) if free and long_enough else -1.0
                 if seen > best[i]:
                     place[i], heading[i], clear[i], best[i] = there, angle, True, seen
@@ -212,10 +213,6 @@ def _roadside(lane: LaneSegment, end: int, away: float) -> tuple[Float[np.ndarra
     return lane.right[end], float(np.arctan2(step[1], step[0]))
 
 
-def _length(line: Float[np.ndarray, "n 3"]) -> float:
-    return float(np.linalg.norm(np.diff(line[:, :2], axis=0), axis=-1).sum())
-
-
 def _rightmost_lanes(sites: list[_Site]) -> list[_Site]:
     ends = [_roadside(lane, end, 0.0) for lane, end in sites]
     right = np.array([point for point, _ in ends]).reshape(-1, 3)
@@ -228,7 +225,7 @@ def _rightmost(right: Float[np.ndarray, "n 3"], heading: Float[np.ndarray, " n"]
     cos, sin = np.cos(heading)[:, None], np.sin(heading)[:, None]
     along = cos * delta[..., 0] + sin * delta[..., 1]
     to_right = sin * delta[..., 0] - cos * delta[..., 1]
-    turned = np.abs((heading[None] - heading[:, None] + np.pi) % (2 * np.pi) - np.pi)
+    turned = np.abs(wrap_angle(heading[None] - heading[:, None]))
     beside = (np.abs(along) < _ALONG) & (np.abs(to_right) < _ACROSS) & (turned < _TURNED)
     # Of two coinciding ends (a duplicated lane) the first counts as the one to the right.
     index = np.arange(len(right))
@@ -244,11 +241,11 @@ def _kerb_distance(
     a = np.concatenate([np.zeros((0, 2)), *(line[:-1, :2] for line in lines)])
     step = np.concatenate([np.zeros((0, 2)), *(line[1:, :2] for line in lines)]) - a
     # start + t direction = a + s step
-    sine = _cross(direction[:, None], step[None])
+    sine = cross(direction[:, None], step[None])
     parallel = sine == 0.0
     sine = np.where(parallel, 1.0, sine)
     away = a[None] - start[:, None]
-    t, s = _cross(away, step[None]) / sine, _cross(away, direction[:, None]) / sine
+    t, s = cross(away, step[None]) / sine, cross(away, direction[:, None]) / sine
     # From half a metre behind the start: the lane's boundary may lie on the kerb.
     meets = ~parallel & (s >= 0.0) & (s <= 1.0) & (t >= -0.5) & (t <= _FARTHEST_KERB)
     nearest = np.where(meets, t, np.inf).min(-1, initial=np.inf)
@@ -260,11 +257,4 @@ def _off_lanes(place: Float[np.ndarray, "m 2"], vector_map: VectorMap) -> Bool[n
     lines = [s.centerline for s in vector_map.segments.values() if s.vehicle and len(s.centerline) > 1]
     a = np.concatenate([np.zeros((0, 2)), *(line[:-1, :2] for line in lines)])
     step = np.concatenate([np.zeros((0, 2)), *(line[1:, :2] for line in lines)]) - a
-    square = (step**2).sum(-1)
-    t = np.clip(((place[:, None] - a) * step).sum(-1) / np.where(square > 0.0, square, 1.0), 0.0, 1.0)
-    distance = np.linalg.norm(a + t[..., None] * step - place[:, None], axis=-1)
-    return distance.min(-1, initial=np.inf) > _CLEAR
-
-
-def _cross(a: Float[np.ndarray, "*b 2"], b: Float[np.ndarray, "*b 2"]) -> Float[np.ndarray, "*b"]:
-    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+    return segment_distances(place, a, step)[1].min(-1, initial=np.inf) > _CLEAR

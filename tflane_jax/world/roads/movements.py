@@ -9,8 +9,9 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
+from tflane_jax.geometry import wrap_angle
 from tflane_jax.scene import LineType
-from tflane_jax.world.roads.curves import blend, right_of, wrap
+from tflane_jax.world.roads.curves import blend, right_of
 from tflane_jax.world.roads.lane_network import Draft, LaneEnd, LaneNetwork
 
 LEFT, THROUGH, RIGHT = 1, 0, -1
@@ -93,7 +94,7 @@ def _ways(approaches: Sequence[Approach], arm: int) -> dict[int, list[int]]:
     """
     inbound = approaches[arm].heading + np.pi
     turns = {
-        j: float(wrap(other.heading - inbound))
+        j: float(wrap_angle(other.heading - inbound))
         for j, other in enumerate(approaches)
         if j != arm and any(lane.vehicle for lane in other.outgoing)
     }
@@ -258,7 +259,7 @@ def _largest_radius(m: Movement, approaches: Sequence[Approach], corner_radius: 
         kerbs = arm.outgoing_kerb, target.incoming_kerb
     to_kerb = float(min(np.hypot(*(m.source.center - kerbs[0])), np.hypot(*(m.sink.center - kerbs[1]))))
     clear = min(to_kerb, 0.5 * max(m.source.width, m.sink.width) + _KERB_CLEARANCE)
-    half_gap = 0.5 * (np.pi - abs(float(wrap(m.sink.heading - m.source.heading))))
+    half_gap = 0.5 * (np.pi - abs(float(wrap_angle(m.sink.heading - m.source.heading))))
     # The rounding's circle must lie inside the turn's with `clear` to spare; both touch the sides of the corner, so
     # that their centres are (radius - corner_radius - to_kerb) / sin(half_gap) apart.
     slope = 1.0 / np.sin(half_gap)
@@ -296,7 +297,7 @@ def _connector_speeds(
 ) -> Float[np.ndarray, " c"]:
     """Return speeds at which the tightest part of each curve is driven comfortably, at most the street's limit."""
     step = np.linalg.norm(np.diff(center, axis=1), axis=-1)
-    curvature = np.abs(wrap(np.diff(heading, axis=1))) / step
+    curvature = np.abs(wrap_angle(np.diff(heading, axis=1))) / step
     tightest = np.quantile(curvature, 0.8, axis=1)
     limit = np.array([min(approaches[m.arm].speed, approaches[m.target].speed) for m in movements])
     return np.minimum(np.sqrt(lateral_acceleration / np.maximum(tightest, 1e-6)), limit)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool, Float
 
-from tflane_jax.world.roads.curves import wrap
+from tflane_jax.geometry import wrap_angle
 from tflane_jax.world.roads.lane_network import LaneNetwork
 from tflane_jax.world.roads.movements import LEFT, RIGHT, STRAIGHT, THROUGH, Approach, Movement
 
@@ -57,7 +57,7 @@ def phases_of(headings: Sequence[float]) -> list[int]:
             continue
         phase[i] = following
         for j in range(i + 1, len(headings)):
-            facing = abs(float(wrap(headings[j] - heading + np.pi))) < STRAIGHT
+            facing = abs(float(wrap_angle(headings[j] - heading + np.pi))) < STRAIGHT
             if phase[j] < 0 and facing:
                 phase[j] = following
                 break

@@ -170,7 +170,7 @@ def _build_side(
     dividers = line.offset(plan.inner + w * np.arange(plan.lanes + 1)[:, None] + shift)
     columns = [_Column(a, b, None) for a, b in pairwise(dividers)]
     for extra, fraction in zip(plan.extras, presence, strict=True):
-        # Where share = 1 the boundary is bit-identical to the neighbour's.
+        # Where fraction = 1 the boundary is bit-identical to the neighbour's.
         if extra.place is Place.RIGHT:
             left, right = plan.outer + shift - w * (1.0 - fraction), plan.outer + shift + w * fraction
         else:

@@ -6,8 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from tflane_jax.geometry import wrap_angle
 from tflane_jax.scene.logs import MapElement
-from tflane_jax.world.roads.curves import direction, right_of, wrap
+from tflane_jax.world.roads.curves import direction, right_of
 from tflane_jax.world.roads.lane_network import LaneEnd
 from tflane_jax.world.roads.movements import LEFT, RIGHT, STRAIGHT, THROUGH, Approach, Movement
 from tflane_jax.world.roads.right_of_way import phases
@@ -75,7 +76,7 @@ def signs(approaches: Sequence[Approach], movements: Sequence[Movement], medians
 def _present(approaches: Sequence[Approach], arm: int) -> set[int]:
     """Return on which sides, LEFT and RIGHT, other arms lie, whether they may be entered or not."""
     ahead = approaches[arm].heading + np.pi
-    turns = [float(wrap(other.heading - ahead)) for j, other in enumerate(approaches) if j != arm]
+    turns = [float(wrap_angle(other.heading - ahead)) for j, other in enumerate(approaches) if j != arm]
     return {LEFT if t > 0 else RIGHT for t in turns if abs(t) > STRAIGHT}
 
 

@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from tflane_jax.geometry import wrap_angle
 from tflane_jax.scene.logs import LaneSegment
 from tflane_jax.world.roads.networks import RoadNetwork
 
@@ -174,7 +175,7 @@ def _headings(
     after = np.concatenate([np.where(inner, chord, 0.0), [0.0]])
     ends = first + count - 1
     before[first], after[ends] = after[first], before[ends]
-    bend = (after - before + np.pi) % (2 * np.pi) - np.pi
+    bend = wrap_angle(after - before)
     heading = before + 0.5 * bend
     # End chords point half a step's turn off the tangent: continue the bend of the next vertex.
     if len(xy) > 2:
@@ -182,7 +183,7 @@ def _headings(
         heading[first[inside]] -= 0.5 * bend[first[inside] + 1]
         heading[ends[inside]] += 0.5 * bend[ends[inside] - 1]
     turn = np.diff(heading, prepend=heading[0])
-    turn = (turn + np.pi) % (2 * np.pi) - np.pi
+    turn = wrap_angle(turn)
     turn[first] = 0.0
     total = np.cumsum(turn)
     return heading[first][owner] + total - total[first][owner]

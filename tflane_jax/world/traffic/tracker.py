@@ -270,7 +270,7 @@ def _table(
     row = identity[frame, k]
     out_position, out_yaw = np.zeros((frames, count, 3)), np.zeros((frames, count))
     occluded, valid = np.zeros((frames, count), bool), np.zeros((frames, count), bool)
-    out_position[frame, row], out_yaw[frame, row] = position[frame, k], wrap_angle(yaw[frame, k])
+    out_position[frame, row], out_yaw[frame, row] = position[frame, k], wrap_outside(yaw[frame, k])
     occluded[frame, row], valid[frame, row] = coasting[frame, k], True
     # A track keeps size and category of the actor that it began with.
     row, first = np.unique(row, return_index=True)
@@ -286,7 +286,7 @@ def _table(
     )
 
 
-def wrap_angle(angle: Float[np.ndarray, "*b"]) -> Float[np.ndarray, "*b"]:
-    """Return angles in (-pi, pi]; those already inside keep their bits."""
+def wrap_outside(angle: Float[np.ndarray, "*b"]) -> Float[np.ndarray, "*b"]:
+    """Return angles in (-pi, pi]; unlike with `geometry.wrap_angle`, those already inside keep their bits."""
     inside = (angle > -np.pi) & (angle <= np.pi)
     return np.where(inside, angle, np.pi - (np.pi - angle) % (2.0 * np.pi))

@@ -1,6 +1,7 @@
 """The command line: what a split holds, as numbers and as pictures."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ import pytest
 from tests.datasets.test_nuscenes_scenes import content
 from tests.datasets.test_road_maps import crossroads_features, write
 from tests.fakes import FakeConfig, FakeDataset
-from tflane_jax.cli import main
+from tflane_jax.cli import build_parser, main
 
 
 def test_data_stats_counts_lanes_and_traffic(capsys):
@@ -65,6 +66,14 @@ def test_where_a_table_cannot_be_written_is_told_before_the_work(arguments, out,
     (tmp_path / "taken.md").mkdir()
     assert main(arguments.replace("OUT", out).split()) == 2
     assert capsys.readouterr().err.startswith("tflane: cannot write ")
+
+
+@pytest.mark.parametrize("command", ["eval RUN", "summary", "data overlap A B", "data stats", "score maptr A B"])
+@pytest.mark.parametrize("out", ["x.json", "x.md", "x.JSON", "x"])
+def test_a_table_may_be_named_with_its_suffix(command, out):
+    """It would become x.json.md and x.json.json."""
+    assert build_parser().parse_known_args([*command.split(), "--out", out])[0].out == Path("x")
+    assert build_parser().parse_known_args([*command.split(), "--out", "run-step2.5"])[0].out == Path("run-step2.5")
 
 
 @pytest.mark.slow

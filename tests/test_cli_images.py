@@ -61,6 +61,13 @@ def test_training_evaluates_by_tusimples_metric_and_draws(trained):
     assert (trained / "curves.png").is_file()
 
 
+def test_prediction_without_data_or_photos_says_what_to_name(trained, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    arguments = ["predict", str(trained), "--data", "tusimple", "--root", "nowhere", "--out", "x"]
+    assert main(arguments) == 2
+    assert "there is no folder nowhere: name that of the data with --root, or name photos" in capsys.readouterr().err
+
+
 def test_evaluation_prints_a_table(trained, capsys):
     assert main(["eval", str(trained)]) == 0
     said = capsys.readouterr().out

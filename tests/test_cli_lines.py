@@ -1,6 +1,7 @@
 """`tflane predict` for a model of the lines of a vector map."""
 
 import json
+import re
 from argparse import Namespace
 
 import numpy as np
@@ -16,7 +17,7 @@ pytest.importorskip("matplotlib")
 
 
 @pytest.mark.parametrize("truth", ["labelled", "derived"])
-def test_prediction_of_lines(tmp_path, monkeypatch, truth):
+def test_prediction_of_lines(tmp_path, monkeypatch, capsys, truth):
     example, out = labelled(), tmp_path / "predictions"
     example = example if truth == "labelled" else example.replace(map_lines=None)
     source, lines = RunConfig().data.source("val"), prediction("without")
@@ -32,9 +33,16 @@ def test_prediction_of_lines(tmp_path, monkeypatch, truth):
     monkeypatch.setattr(predict_lanes, "source_for", lambda *_: source)
     monkeypatch.setattr(predict_lanes.sources, "open_dataset", lambda *_: Dataset())
     monkeypatch.setattr(predict_lanes, "predict_examples", lambda *_: answer)
-    options = Namespace(count=1, out=out, threshold=0.5, max_instances=None, cameras=False)
+    options = Namespace(count=1, out=out, threshold=1.0, max_instances=None, cameras=False)
+    assert predict_lanes.predict(Run("run", RunConfig(), 1, ({},)), options) == 0
+    assert re.match(
+        r"1 frame, 0 lanes with a score of at least 1 \(best 0\.\d+: choose a lower --threshold to see it\); written",
+        capsys.readouterr().out,
+    )
+    options.threshold = 0.5
     assert predict_lanes.predict(Run("run", RunConfig(), 1, ({},)), options) == 0
 
+    assert capsys.readouterr().out.startswith("1 frame, 4 lanes with a score of at least 0.5; written to ")
     arrays = np.load(out / "predictions.npz")
     assert set(arrays) == {"points", "scores", "category", "scene", "timestamp_ns"}
     assert arrays["points"].shape == (1, 6, 5, 2)

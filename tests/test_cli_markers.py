@@ -63,11 +63,24 @@ def test_a_damaged_photo_is_named_and_the_others_are_searched(photos, tmp_path, 
     assert "a.png" in said.out
 
 
+def test_intrinsics_of_another_image_size_are_a_fault(photos, tmp_path, capsys):
+    """The principal point lies outside; a pose would be silently wrong."""
+    out = tmp_path / "out"
+    intrinsics = ["--intrinsics", "1776", "1776", "775", "1024"]
+    assert main(["markers", "detect", str(photos / "a.png"), *intrinsics, "--out", str(out)]) == 2
+    written = json.loads((out / "detections.json").read_text())
+    assert written["photos"] == []
+    words = "a.png is 960 x 540, but the principal point is (775, 1024): are the intrinsics of another image size?"
+    assert words in written["faults"][0]["error"]
+    assert words in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [
         (["--family", "QR"], "ARUCO_5X5_100"),
         (["--size", "0"], "tflane: --size is 0.0: it must be"),
+        (["--size", "300"], "tflane: --size is 300.0: it must be a finite number from 0.01 to 100 metres"),
         (["--distortion", "0.1"], "--distortion"),
         (["--intrinsics", "0", "900", "1", "1"], "--intrinsics"),
         (["--enlarge", "0"], "tflane: --enlarge is 0: it must be"),

@@ -1,6 +1,5 @@
-"""Configurations: files, overrides, text and JSON, and the golden text of every shipped configuration."""
+"""Configurations: files, text and JSON, and the golden text of every shipped configuration."""
 
-import dataclasses
 import enum
 import functools
 import json
@@ -14,11 +13,9 @@ import pytest
 from tests.shared import ROOT
 from tflane_jax.config import LogData, OpenLaneV2Data, RunConfig, load_ablations, load_config, with_reference_batch
 from tflane_jax.config_files import shipped_configs
-from tflane_jax.config_io import from_json, settings, to_json, to_text
+from tflane_jax.config_io import from_json, to_json, to_text
 from tflane_jax.config_overrides import apply_overrides
 from tflane_jax.errors import UserError
-from tflane_jax.markers.simulation import MarkerConfig, MarkerSimulationConfig
-from tflane_jax.models.marker_fusion import MarkerFusionConfig
 from tflane_jax.models.priors import PriorsConfig
 from tflane_jax.models.toponet import TopoNetConfig
 from tflane_jax.models.traffic_flow_module import TrafficFlowConfig
@@ -178,84 +175,6 @@ def test_settings_that_a_file_lacks_take_their_defaults():
 
 
 @pytest.mark.parametrize(
-    ("arguments", "changed"),
-    [
-        ([], {}),
-        (["--optim.lr", "1e-3"], {"optim.lr": 1e-3}),
-        (["--optim.lr=1e-3", "--training.seeds", "4", "5"], {"optim.lr": 1e-3, "training.seeds": (4, 5)}),
-        (["--training.init-from", "runs/a"], {"training.init_from": "runs/a"}),
-        (
-            ["--task.model.priors.traffic_flow.prior.top_instances", "0"],
-            {"task.model.priors.traffic_flow.prior.top_instances": 0},
-        ),
-        (["--data.world.severity", "1"], {"data.world.severity": 1.0}),
-    ],
-)
-def test_overrides_change_only_the_named_setting(arguments, changed):
-    before, after = dict(settings(FLOW)), dict(settings(apply_overrides(FLOW, arguments)))
-    differing = {k: v for k, v in after.items() if v != before[k] and not dataclasses.is_dataclass(v)}
-    assert differing == changed
-
-
-def test_parts_are_switched_on_and_off():
-    arguments = [
-        "--data.example.markers.simulation.jump",
-        "0.2",
-        "--data.example.markers",
-        "default",
-        "--task.model.priors.markers.memory",
-        "None",
-        "--task.model.priors.traffic-flow=None",
-        "--task.model.priors.markers",
-        "MarkerFusionConfig",
-    ]
-    config = apply_overrides(FLOW, arguments)
-    model = FLOW.task.model
-    assert config.data.example == replace(
-        FLOW.data.example, markers=MarkerConfig(simulation=MarkerSimulationConfig(jump=0.2))
-    )
-    assert config.task.model == replace(
-        model, priors=replace(model.priors, traffic_flow=None, markers=MarkerFusionConfig(memory=None))
-    )
-    assert (
-        apply_overrides(config, ["--task.model.priors.traffic_flow", "default"]).task.model.priors.traffic_flow
-        is not None
-    )
-
-
-def test_settings_of_other_data_can_be_changed():
-    config = RunConfig(data=OpenLaneV2Data(Path("a")))
-    arguments = ["--data.image.scale", "0.25", "--data.augmentation.grid-mask", "0.7", "--data.root", "b"]
-    data = apply_overrides(config, arguments).data
-    assert isinstance(data, OpenLaneV2Data)
-    assert (data.image.scale, data.augmentation.grid_mask, data.root) == (0.25, 0.7, Path("b"))
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["--optim.lrr", "1"], r"unknown setting --optim\.lrr: did you mean --optim\.lr\?"),
-        (["--lr", "1"], r"did you mean --optim\.lr\?"),
-        (["--xyz", "1"], "see --help for all settings"),
-        (["--training.steps", "1.5"], "invalid literal|could not"),
-        (["--training.steps"], "Missing value"),
-        (["--task.losses.matcher", "magic"], "invalid choice 'magic'"),
-        (["stray"], "stray"),
-        (
-            ["--task.model.priors.markers", "on"],
-            r"--task\.model\.priors\.markers takes None, default, MarkerFusionConfig, not 'on'",
-        ),
-        (["--task.model.priors.markers"], "takes None, default"),
-        (["--data", "OpenLaneV2Data"], "OpenLaneV2Data has no defaults for all of its settings"),
-    ],
-)
-def test_invalid_overrides_give_a_one_line_error(arguments, message):
-    with pytest.raises(UserError, match=message) as error:
-        apply_overrides(FLOW, arguments)
-    assert "\n" not in str(error.value)
-
-
-@pytest.mark.parametrize(
     ("content", "message"),
     [
         ("x = 1", r"has no function get_config\(\)"),
@@ -271,6 +190,33 @@ def test_invalid_config_files_are_named(tmp_path, content, message):
     with pytest.raises(UserError, match=message) as error:
         load_config(str(path))
     assert str(path) in str(error.value)
+
+
+@pytest.mark.parametrize("folder", ["", "sub/"])
+def test_the_line_of_an_error_is_named_for_relative_paths_too(folder, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "sub").mkdir()
+    Path(f"{folder}own.py").write_text("def get_config():\n    return 1 / 0\n")
+    with pytest.raises(UserError, match=rf"config file {folder}own\.py, line 2: ZeroDivisionError"):
+        load_config(f"{folder}own.py")
+
+
+@pytest.mark.parametrize("ablation", ["", ":wrong"])
+@pytest.mark.parametrize(
+    ("setting", "allowed"),
+    [("optim", "OptimConfig"), ("training", "TrainingConfig"), ("task", "LaneGraphTask or LaneShapeTask")],
+)
+def test_a_part_of_the_wrong_type_is_named_with_its_line(setting, allowed, ablation, tmp_path):
+    path = tmp_path / "own.py"
+    path.write_text(
+        "from tflane_jax.config import RunConfig\n\n\ndef get_config():\n"
+        f"    return RunConfig({setting}={{'lr': 1e-3}})\n\n\n"
+        "def ablations():\n    return {'wrong': get_config(), 'number': 3}\n"
+    )
+    with pytest.raises(UserError, match=rf"own\.py, line 5: {setting} is {{'lr': 0\.001}}: it must be {allowed}"):
+        load_config(f"{path}{ablation}")
+    with pytest.raises(UserError, match=r"ablation number of config file .*own\.py is a int, not a RunConfig"):
+        load_config(f"{path}:number")
 
 
 @pytest.mark.parametrize(

@@ -96,8 +96,8 @@ def test_without_compiling_memory_is_not_estimated(counted):
     ("change", "message"),
     [
         ({"devices": 3}, "choose a multiple of 3"),
-        ({"devices": 0}, "at least one device"),
-        ({"utilisation": 1.5}, "1.5"),
+        ({"devices": 0}, "^--plan 0: at least 1 device$"),
+        ({"utilisation": 1.5}, "^--utilisation 1.5: above 0 and at most 1$"),
     ],
 )
 def test_what_cannot_be_is_named(counted, change, message):

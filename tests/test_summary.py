@@ -31,6 +31,7 @@ def test_the_command_counts_every_parameter_once(tmp_path, capsys):
     assert main(arguments) == 0
     printed = capsys.readouterr().out
     saved = json.loads((tmp_path / "cost.json").read_text())
+    assert f"written to {tmp_path / 'cost.md'} and {tmp_path / 'cost.json'}" in printed
     assert f"{sum(saved['meta']['parameters'].values()):,}" in printed
     assert all(count > 0 for count in saved["meta"]["parameters"].values())
     (row,) = saved["rows"]

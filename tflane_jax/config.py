@@ -105,11 +105,16 @@ def load_config(reference: str) -> RunConfig:
         raise UserError(
             f"config file {name} has no ablation {ablation}, only {', '.join(ablations)}{_did_you_mean(close)}"
         )
-    return _checked(find_config(name), with_reference_batch(ablations[ablation], ablations[ablation]))
+    config = ablations[ablation]
+    if not isinstance(config, RunConfig):
+        raise UserError(f"ablation {ablation} of config file {name} is a {type(config).__name__}, not a RunConfig")
+    return _checked(find_config(name), with_reference_batch(config, config))
 
 
 def with_reference_batch(config: RunConfig, chosen: RunConfig) -> RunConfig:
     """Return a configuration whose learning rate is scaled, if it is, from the batch of the one it was chosen for."""
+    if not (isinstance(config.optim, OptimConfig) and isinstance(chosen.training, TrainingConfig)):
+        return config  # of a file; its check names the type
     if config.optim.lr_scaling == "none" or config.optim.reference_batch is not None:
         return config
     optim = dataclasses.replace(config.optim, reference_batch=chosen.training.batch_size)
@@ -180,7 +185,8 @@ def _named_errors(path: Path):
     try:
         yield
     except Exception as error:
-        lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(path)]
+        own = str(path.absolute())  # the import system makes names absolute
+        lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == own]
         line = error.lineno if isinstance(error, SyntaxError) else lines[-1] if lines else "?"
         if (
             unknown := re.search(r"(\w+)\.__init__\(\) got an unexpected keyword argument '(\w+)'", str(error))

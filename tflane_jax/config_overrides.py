@@ -14,6 +14,18 @@ from tflane_jax.config_io import choices, settings, with_setting
 from tflane_jax.errors import UserError
 from tflane_jax.limits import check_settings
 
+# Settings by their names in other programs.
+_SYNONYMS = {
+    "batch": "training.batch_size",
+    "epochs": "training.steps",
+    "iterations": "training.steps",
+    "learning_rate": "optim.lr",
+}
+# Python's messages about text that is no number, as tyro shows them.
+_NO_NUMBER = re.compile(
+    r"Error parsing (--\S+): (?:(invalid literal for int\(\) with base 10)|could not convert string to float): ('.*')"
+)
+
 
 def apply_overrides(config: RunConfig, arguments: Sequence[str]) -> RunConfig:
     """Return the configuration with settings changed by `--a.b.c value` arguments, typed by tyro.
@@ -87,11 +99,17 @@ def _check_names(config: RunConfig, arguments: Sequence[str]) -> None:
 
 
 def _closest(name: str, known: list[str]) -> list[str]:
-    """Return up to three similar names: compared as a whole, else by their last parts."""
-    whole = difflib.get_close_matches(name, known, 3, 0.75)
+    """Return up to three similar names: of the same last part or meaning, as a whole, else by their last parts."""
     last = name.rpartition(".")[2]
-    parts = difflib.get_close_matches(last, sorted({k.rpartition(".")[2] for k in known}), 3, 0.75)
-    return (whole or [k for part in parts for k in known if k.rpartition(".")[2] == part])[:3]
+    by_last: dict[str, list[str]] = {}
+    for k in known:
+        by_last.setdefault(k.rpartition(".")[2], []).append(k)
+    same = sorted(by_last.get(last, []), key=lambda k: -difflib.SequenceMatcher(None, name, k).ratio())
+    meant = [_SYNONYMS[last]] if _SYNONYMS.get(last) in known else []
+    if whole := [*meant, *same, *difflib.get_close_matches(name, known, 3, 0.75)]:
+        return list(dict.fromkeys(whole))[:3]
+    parts = difflib.get_close_matches(last, sorted(by_last), 3, 0.75)
+    return [k for part in parts for k in by_last[part]][:3]
 
 
 def _without_boxes(text: str) -> str:
@@ -99,4 +117,8 @@ def _without_boxes(text: str) -> str:
     # tyro prints a title, a rule (unless framed), the message, a rule, hints.
     lines = [re.sub(r"[│─╭╮╰╯]|-{3,}", " ", line).strip() for line in text.splitlines()[1:]]
     paragraphs = re.split(r"\n{2,}", "\n".join(lines).strip())
-    return paragraphs[0].replace("\n", " ")
+    message = paragraphs[0].replace("\n", " ")
+    if (wrong := _NO_NUMBER.search(message)) is None:
+        return message
+    name, whole, value = wrong.groups()
+    return f"{name} is {value}: it must be a {'whole ' if whole else ''}number"

@@ -1,6 +1,10 @@
 """The errors that the command line shows to its user."""
 
 
+class LeftOutWarning(UserWarning):
+    """Parts of an input that are not used, though a user may think so."""
+
+
 class UserError(Exception):
     """A mistake that the user can correct. The message names the cause and the remedy.
 

@@ -96,8 +96,10 @@ def make_plan(
     Raises:
         UserError: the batch cannot be shared, or a number is out of range.
     """
-    if devices < 1 or not 0.0 < utilisation <= 1.0:
-        raise UserError(f"--plan {devices} --utilisation {utilisation}: at least one device, above 0 and at most 1")
+    if devices < 1:
+        raise UserError(f"--plan {devices}: at least 1 device")
+    if not 0.0 < utilisation <= 1.0:
+        raise UserError(f"--utilisation {utilisation:g}: above 0 and at most 1")
     passes = devices * training.accumulate
     if training.batch_size % passes:
         raise UserError(

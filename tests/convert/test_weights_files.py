@@ -35,6 +35,7 @@ def test_a_missing_file_is_named_with_its_source_and_checksum(folders):
     said = str(error.value)
     for word in (*map(str, folders), LSTR.url, LSTR.licence, LSTR.digest, "TFLANE_WEIGHTS", *LSTR.files):
         assert word in said, word
+    assert f" into {folders[-1]}, or name" in said
 
 
 @pytest.mark.parametrize("file", LSTR.files)

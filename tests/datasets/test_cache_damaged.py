@@ -113,6 +113,7 @@ def test_the_cache_is_listed_and_cleared(tmp_path, entry, capsys, monkeypatch):
     assert main(["cache", "clear", other.name[:-1]]) == 2
     assert f"did you mean {other.name}?" in capsys.readouterr().err
     assert main(["cache", "clear", "--older", "1"]) == 0  # all were just written
+    assert capsys.readouterr().out == "nothing to delete\n"
     assert main(["cache", "clear", other.name, other.name]) == 0
     assert not other.exists()
     assert main(["cache", "clear", "--all"]) == 0

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from tflane_jax.datasets.base import TruncationWarning
 from tflane_jax.datasets.geojson import Origin, RoadLines, read_geojson, sd_map_around, to_ego
-from tflane_jax.errors import UserError
+from tflane_jax.errors import LeftOutWarning, UserError
 from tflane_jax.scene import SdCategory
 from tflane_jax.world.roads.sd_map import SdMapConfig
 
@@ -121,10 +121,7 @@ BAD = {
     "no lines": (feature(None, "MultiLineString", highway="road"), "feature 1 is no line of at least two points"),
     "latitude first": (feature([[49.0, 8.4], [49.0, 98.4]], highway="road"), "longitude first"),
     "nan": (feature([[float("nan"), 8.4], [49.0, 8.4]], highway="road"), "feature 1 leaves the Earth"),
-    "no category": (feature(LINE, name="x"), "neither of the properties `highway` and `category`"),
-    "no properties": (feature(LINE) | {"properties": None}, "neither of the properties"),
     "unknown category": (feature(LINE, category="raod"), "'raod': choose one of road, cross_walk"),
-    "null": (feature(LINE, highway=None, category=None), "neither of the properties"),
     "category of a list": (feature(LINE, category=["road"]), r"the category \['road'\]: choose one of road"),
     "geometry of a list": (feature(LINE, ["LineString"]), r"feature 1 has a geometry of type \['LineString'\]"),
     "number of hundreds of digits": (
@@ -134,8 +131,35 @@ BAD = {
     "no feature": ({"type": "Way"}, "feature 1 is no GeoJSON Feature"),
     "a list": ([], "feature 1 is no GeoJSON Feature"),
     "geometry": (feature(LINE, "Line", highway="road"), "feature 1 has a geometry of type 'Line'"),
-    "named": (feature(LINE) | {"id": "way/12"}, r"feature 1 \(way/12\) has neither"),
+    "named": (feature(7, highway="road") | {"id": "way/12"}, r"feature 1 \(way/12\) is no line"),
 }
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        feature(LINE, waterway="river"),
+        feature(LINE, highway=None, category=None),
+        feature(LINE) | {"properties": None},
+        feature([[8.4, 49.0]], power="line"),
+    ],
+)
+def test_lines_that_are_no_roads_are_left_out_with_a_warning(other, tmp_path):
+    """Exports of a region contain rivers, buildings and power lines."""
+    path = write(tmp_path / "map.geojson", other | {"id": "way/12"}, feature(LINE, highway="road"), other)
+    with pytest.warns(LeftOutWarning, match=r"2 of 3 lines have neither .*: feature 0 \(way/12\)"):
+        roads = read_geojson(path)
+    assert roads.category == (SdCategory.ROAD,)
+    with pytest.raises(UserError, match=r"feature 0 has neither of the properties `highway` and `category`, and no"):
+        read_geojson(write(path, other))
+
+
+def test_a_map_of_another_place_is_refused(tmp_path):
+    roads = read_geojson(write(tmp_path / "map.geojson", feature(LINE, highway="road")))
+    with pytest.raises(UserError, match=r"the nearest road is about \d,\d\d\d km .*longitude and latitude swapped\?"):
+        sd_map_around(roads, Origin(latitude=8.4, longitude=49.0), SdMapConfig())
+    # A vehicle that has left the map has no lines.
+    assert not sd_map_around(roads, Origin(49.2, 8.4), SdMapConfig()).valid.any()
 
 
 @pytest.mark.parametrize("name", BAD)

@@ -10,7 +10,7 @@ import pytest
 
 from tests.golden import case_id, golden_modules, load_module_case
 from tests.shared import random_photo
-from tflane_jax.errors import UserError
+from tflane_jax.errors import LeftOutWarning, UserError
 from tflane_jax.files.images import list_photos, read_image, resize
 
 RED = np.full((6, 8, 3), (0, 0, 255), np.uint8)  # BGR
@@ -104,11 +104,14 @@ def test_absent_opencv_names_the_extra(monkeypatch):
 
 
 def test_folders_stand_for_their_photos(tmp_path):
-    for name in ("b.JPG", "a.png", "notes.txt"):
+    for name in ("b.JPG", "a.png", "notes.txt", "still.gif", "IMG_1.heic", ".hidden"):
         (tmp_path / name).touch()
     (tmp_path / "sub.png").mkdir()
     named = tmp_path / "notes.txt"
-    assert list_photos([tmp_path, named]) == [tmp_path / "a.png", tmp_path / "b.JPG", named]
+    others = r"2 of 5 files in .* have no photo's suffix and are left out: IMG_1.heic, notes.txt$"
+    with pytest.warns(LeftOutWarning, match=others):
+        found = list_photos([tmp_path, named])
+    assert found == [*(tmp_path / name for name in ("a.png", "b.JPG", "still.gif")), named]
     with pytest.raises(UserError, match=r"sub.png holds no photo \(looked for"):
         list_photos([tmp_path / "sub.png"])
     with pytest.raises(UserError, match=r"no file or folder .*nothing"):

@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from tflane_jax.plots.tables import format_table, latex_table, save_table
+from tflane_jax.plots.tables import format_table, latex_table, save_table, written_to
 
 ROWS = [
     {"model": "baseline", "DET_l": 0.25, "lanes": 7, "best": False},
@@ -75,3 +75,5 @@ def test_both_files_hold_the_rows(tmp_path):
         "rows": [{"x": 1.5, "y": None, "z": [0, 1], "path": str(tmp_path)}],
     }
     assert len(list(text.parent.iterdir())) == 2
+    assert written_to([text, data]) == f"written to {text} and {data}"
+    assert written_to([text]) == f"written to {text}"

@@ -120,6 +120,13 @@ def test_too_few_frames_is_an_error():
         select_traffic_flow(make_flow(frames=4), CONFIG)
 
 
+def test_a_batch_is_named_as_such():
+    """Its second axis would be taken for the frames."""
+    batch = jax.tree.map(lambda leaf: np.asarray(leaf)[None], make_flow(7))
+    with pytest.raises(ValueError, match=r"position has shape \(1, 16, 20, 3\), expected \(K, N, 3\): one frame"):
+        select_traffic_flow(batch, CONFIG)
+
+
 @settings(max_examples=60)
 @given(st.floats(0.5, 70), st.floats(-np.pi, np.pi), st.floats(0.1, 30))
 def test_weights(distance, bearing, farther):

@@ -171,7 +171,9 @@ def test_a_pickle_that_runs_code_is_refused(files, capsys):
     [
         (["openlane-v3", "a.pkl", "b.pkl"], "no protocol 'openlane-v3', only openlane-v2.1-centerline"),
         ([PROTOCOL, "a.pkl", "b.pkl"], "cannot read a.pkl"),
-        ([PROTOCOL, "a.txt", "b.pkl"], "a.txt: expected a .json or .pkl file"),
+        ([PROTOCOL, "a.txt", "b.pkl"], "a.txt: expected a .pkl, .json or .npz file"),
+        ([PROTOCOL, "a.npy", "b.pkl"], "a.npy: expected a .pkl, .json or .npz file; docs/scoring.md says"),
+        (["lanesegnet", "a.txt", "b.pkl"], "a.txt: expected a .json or .pkl file"),
         ([PROTOCOL, "a.pkl", "b.pkl", "--bootstrap", "-1"], "--bootstrap -1"),
     ],
 )

@@ -126,6 +126,27 @@ def test_crossings_among_segments_are_no_lanes(tmp_path):
         read_predictions(tmp_path / "p.npz")
 
 
+@pytest.mark.parametrize(
+    ("points", "remarked"),
+    [
+        (np.stack([np.linspace(0.0, 30.0, 11), np.full(11, 2.0), np.zeros(11)], -1), False),
+        (np.stack([np.full(11, 2.0), np.linspace(0.0, 30.0, 11), np.zeros(11)], -1), True),  # swapped axes
+        (np.zeros((0, 3)), False),  # nothing predicted is no question of axes
+    ],
+)
+def test_a_file_of_which_no_line_matches_is_remarked(tmp_path, capsys, points, remarked):
+    lines = [points.tolist()] if len(points) else []
+    name, successor = {"scene": "a", "timestamp_ns": 1}, [[0] * len(lines)] * len(lines)
+    line = np.stack([np.linspace(0.0, 30.0, 11), np.full(11, 2.0), np.zeros(11)], -1).tolist()
+    write_json(
+        tmp_path,
+        [name | {"points": lines, "scores": [0.1] * len(lines), "successor": successor}],
+        [name | {"points": [line], "successor": [[0]]}],
+    )
+    assert run(tmp_path, "json")[0] == 0
+    assert ("no predicted line is near a true one" in capsys.readouterr().err) == remarked
+
+
 def test_every_lane_is_in_one_distance_group(tmp_path, capsys):
     write_npz(tmp_path)
     rows = run(tmp_path, "npz", "--by", "distance")[1]
@@ -173,6 +194,7 @@ def test_unsupported_groupings_are_named(tmp_path, capsys):
         ({"scores": np.ones((3, 5))}, r"scores has shape \(3, 5\), expected \(3, 4\)"),
         ({"points": np.ones((3, 4, 11))}, r"points has shape \(3, 4, 11\), expected \(frames"),
         ({"scores": np.full((3, 4), 2.0)}, r"frame a at 1 ns: scores: number 0 is 2"),
+        ({"timestamp_ns": np.array([1.0, 2.0, 1.0])}, r"timestamp_ns is 1\.0, expected whole nanoseconds"),
         ({"timestamp_ns": np.array([1, 1, 1])}, r"frame a at 1 ns is there twice"),
         ({"scene": np.array(["a", "a", "c"])}, r"missing from the predictions: b at 1 ns"),
     ],

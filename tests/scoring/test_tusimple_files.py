@@ -62,6 +62,21 @@ def test_real_labels_against_themselves(tmp_path):
     assert (row["frames"], row["FP"], row["FN"]) == (len(labels), 0.0, 0.0)
 
 
+def test_slow_images_are_remarked(tmp_path, capsys):
+    slow = [record | {"run_time": 300} for record in GUESS]
+    assert run(tmp_path, slow)[1]["FN"] == 1.0
+    said = capsys.readouterr().err
+    assert "3 of 3 images took longer than 200 ms and count as without lanes, by TuSimple's rule" in said
+    assert "tusimple-lstr allows 20 s" in said
+    run(tmp_path, slow, protocol="tusimple-lstr")
+    assert "longer than" not in capsys.readouterr().err
+
+
+def test_predictions_and_labels_that_are_swapped_are_guessed(tmp_path, capsys):
+    assert run(tmp_path, TRUTH, GUESS)[0] == 2
+    assert "It looks like ground truth: are PREDICTIONS and GROUND_TRUTH swapped?" in capsys.readouterr().err
+
+
 def change(record, **fields):
     return [GUESS[0], {k: v for k, v in (record | fields).items() if v is not ...}, GUESS[2]]
 
@@ -81,6 +96,15 @@ DAMAGE = {
     ),
     "NaN": (change(GUESS[1], lanes=[[1, 2, float("nan"), 4]]), r"line 2 \(.*\): lanes\[0\] holds nan at \[2\]"),
     "time": (change(GUESS[1], run_time="fast"), r"line 2 \(.*\): run_time is of type str"),
+    "no time": (change(GUESS[1], run_time=...), r"lacks the entry 'run_time' \([^()]*\)$"),
+    "prefix": (
+        [record | {"raw_file": f"/data/tusimple/{record['raw_file']}"} for record in GUESS],
+        r"name frames with the prefix /data/tusimple/, the ground truth without: take it off$",
+    ),
+    "backslashes": (
+        [record | {"raw_file": "D:\\" + record["raw_file"].replace("/", "\\")} for record in GUESS],
+        r"name frames with the prefix D:/ and backslashes, the ground truth without",
+    ),
     "no name": (change(GUESS[1], raw_file=...), r"line 2 lacks the entry 'raw_file'"),
     "a list": ([GUESS[0], [1], GUESS[2]], r"line 2 is of type list, expected a mapping"),
 }
@@ -91,7 +115,7 @@ def test_damaged_predictions_are_named_to_the_line(tmp_path, capsys, damage):
     guess, message = DAMAGE[damage]
     assert run(tmp_path, guess)[0] == 2
     said = capsys.readouterr().err
-    assert re.search(message, said), said
+    assert re.search(message, said.strip()), said
     assert not (tmp_path / "out.json").exists()
 
 

@@ -123,6 +123,13 @@ def test_only_a_run_is_said_to_have_ended_before_its_first_checkpoint(tmp_path, 
         Checkpoints(tmp_path / "checkpoints").find("last")
 
 
+def test_runs_inside_a_folder_that_is_none_are_suggested(tmp_path):
+    (tmp_path / "tfm").mkdir()
+    (tmp_path / "tfm" / "config.json").touch()
+    with pytest.raises(UserError, match=r"is no run folder: .*; did you mean .*tfm\?$"):
+        Checkpoints(tmp_path / "checkpoints").find("last")
+
+
 def largest_file(folder):
     return max((p for p in (folder / "state").rglob("*") if p.is_file()), key=lambda p: p.stat().st_size)
 

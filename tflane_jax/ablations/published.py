@@ -15,7 +15,7 @@ from tflane_jax.ablations.tables import TABLES
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import write_text
 from tflane_jax.files.fields import load_json, member
-from tflane_jax.plots.tables import format_table
+from tflane_jax.plots.tables import counted, format_table
 
 _WIDTH = 120
 
@@ -85,7 +85,7 @@ def _section(summary: Mapping[str, Any]) -> list[str]:
     cores = _listed(summary["cores of a run"])
     rows = _without_repeated(summary["rows"])
     facts = (
-        f"{_counted(len(summary['seeds']), 'seed')}, {_updates(summary['steps'])}, each on {cores} "
+        f"{counted(len(summary['seeds']), 'seed')}, {_updates(summary['steps'])}, each on {cores} "
         f"core{'' if cores == '1' else 's'} ({_listed(summary['devices'])}); the updates of a run took "
         f"{_between(minutes.values())} minutes, other work beside it; code {_listed(summary['commits'])}. "
         f"{summary['protocol']}, test split of the built-in world, percent (mean ± std over seeds). "
@@ -144,10 +144,6 @@ def _without_repeated(rows: Sequence[Mapping[str, Any]]) -> list[Mapping[str, An
         )
 
     return [row for row in rows if not repeats(row)]
-
-
-def _counted(number: int, thing: str) -> str:
-    return f"{number} {thing}{'' if number == 1 else 's'}"
 
 
 def _listed(values: Sequence[Any]) -> str:

@@ -27,8 +27,10 @@ def show(options: argparse.Namespace) -> int:
 
 def clear(options: argparse.Namespace) -> int:
     """Delete entries of the cache. What a process is building stays; naming it is an error."""
-    entries = cache_entries(cache_root())
-    for one in _chosen(entries, options):
+    chosen = _chosen(cache_entries(cache_root()), options)
+    if not chosen:
+        print("nothing to delete")
+    for one in chosen:
         if one.building and not options.names:
             print(f"kept {one.path}: {one.kind}")
             continue

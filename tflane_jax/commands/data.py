@@ -20,6 +20,7 @@ from tflane_jax.datasets.overlap import overlap, read_drives
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import check_stem
 from tflane_jax.plots import dataset_summary, format_table, save_camera_views, save_table, show_dataset
+from tflane_jax.plots.tables import counted, written_to
 from tflane_jax.scene import RoadImage, stack_examples
 from tflane_jax.tasks import spread
 from tflane_jax.tasks.lane_pictures import titles
@@ -104,7 +105,11 @@ def check(options: argparse.Namespace) -> int:
         raise UserError(f"{error}; name other data with --format ({others})") from None
     print(format_table(found.rows, title=f"{options.root}: {found.format}"))
     if found.faults:
-        print(f"\n{len(found.faults)} faults:", *(f"  - {fault}" for fault in found.faults[:_PRINTED_FAULTS]), sep="\n")
+        print(
+            f"\n{counted(len(found.faults), 'fault')}:",
+            *(f"  - {fault}" for fault in found.faults[:_PRINTED_FAULTS]),
+            sep="\n",
+        )
     if len(found.faults) > _PRINTED_FAULTS:
         print(f"  ... and {len(found.faults) - _PRINTED_FAULTS} more")
     if found.skipped:
@@ -132,7 +137,7 @@ def overlap_of_splits(options: argparse.Namespace) -> int:
     if options.out is not None:
         sides = {"train": str(options.train), "validation": str(options.validation)}
         meta = {**sides, "worst": found.worst(len(validation))}
-        print("\nwritten to", *save_table(options.out, found.rows(), meta, title=title))
+        print(f"\n{written_to(save_table(options.out, found.rows(), meta, title=title))}")
     return 0
 
 

@@ -21,6 +21,7 @@ from tflane_jax.evaluation.scene_statistics import frame_quantities, lane_quanti
 from tflane_jax.files.atomic import check_stem
 from tflane_jax.plots import format_table, save_table
 from tflane_jax.plots.distributions import save_distributions
+from tflane_jax.plots.tables import written_to
 from tflane_jax.scene import Example, RoadImage
 from tflane_jax.tasks import spread
 
@@ -64,7 +65,7 @@ def beside(config: RunConfig, options: argparse.Namespace) -> int:
         paths = list(save_table(options.out, rows, {"values": _summary(values)}, title=title))
         if importlib.util.find_spec("matplotlib") is not None:
             paths.append(save_distributions(options.out.with_name(f"{options.out.name}.png"), values))
-        print("\nwritten to", *paths)
+        print(f"\n{written_to(paths)}")
     return 0
 
 

@@ -24,7 +24,7 @@ from tflane_jax.evaluation.edge_types import weights_edge_types
 from tflane_jax.evaluation.interventions import with_traffic
 from tflane_jax.evaluation.lane_errors import lane_errors
 from tflane_jax.files.atomic import check_stem
-from tflane_jax.plots.tables import format_table, save_table
+from tflane_jax.plots.tables import format_table, save_table, written_to
 from tflane_jax.runs import Run, evaluate_run
 from tflane_jax.scene import stack_examples
 from tflane_jax.startup import showing, stage
@@ -82,7 +82,7 @@ def run(options: argparse.Namespace) -> int:
     paths = [*save_table(stem, rows, meta, title=title), *_save_edge_types(trained, source, stem)]
     if options.errors:
         paths += _save_errors(trained, task or trained.config.task, source, stem, meta)
-    print(f"\nwritten to {', '.join(map(str, paths[:-1]))} and {paths[-1]}")
+    print(f"\n{written_to(paths)}")
     return 0
 
 

@@ -6,7 +6,7 @@ detections.json:
      "reprojection", "ambiguity", "pose"}, ...]}, ...],
      "faults": [{"file", "error"}, ...]}
     Position and pose (ego_from_marker, 4 x 4) are in the ego frame, on the ground below the camera: x forward, y left,
-    z up, metres. `faults` are photos that could not be read.
+    z up, metres. `faults` are photos that could not be read or are of another size than the intrinsics.
 
 `curves` writes curves-NAME.md and .json for each curve, and curves.png.
 """
@@ -24,7 +24,7 @@ from jaxtyping import Float, UInt8
 from tflane_jax.commands.sources import make_folder
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import write_bytes, write_json
-from tflane_jax.files.images import list_photos, opencv, read_image, undistorted
+from tflane_jax.files.images import check_centre, list_photos, opencv, read_image, undistorted
 from tflane_jax.geometry.cameras import project
 from tflane_jax.limits import check_settings
 from tflane_jax.markers.curves import CurveConfig, measure, summarise
@@ -44,7 +44,8 @@ _OUTLINE = (255, 210, 0)
 def find(options: argparse.Namespace) -> int:
     """Detect markers in photos of one calibrated camera; print a table, write pictures and detections.json.
 
-    A photo that cannot be read is recorded and told, the others are searched, and the result is 2.
+    A photo that cannot be read, or that the intrinsics do not fit, is recorded and told, the others are searched, and
+    the result is 2.
     """
     opencv()  # without it, every photo would be a fault
     photos = list_photos(options.images)
@@ -68,6 +69,7 @@ def find(options: argparse.Namespace) -> int:
     for number, path in enumerate(photos):
         try:
             photo = read_image(path)
+            check_centre(path, photo, intrinsics)
         except UserError as error:
             faults.append({"file": str(path), "error": str(error)})
             continue

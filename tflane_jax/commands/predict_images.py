@@ -20,6 +20,7 @@ from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import write_text
 from tflane_jax.files.tusimple import RowLanes
 from tflane_jax.plots.images import save_road_images
+from tflane_jax.plots.tables import counted
 from tflane_jax.runs import Run
 from tflane_jax.scene import stack_examples
 from tflane_jax.tasks import spread
@@ -28,7 +29,11 @@ from tflane_jax.tasks.lane_shape import found_lanes, predict_curves
 
 def predict_split(trained: Run, options: argparse.Namespace) -> int:
     """Predict the lane lines in some images of a split; write predictions and ground truth."""
-    dataset = sources.open_dataset(chosen_source(trained.config, options))
+    source = chosen_source(trained.config, options)
+    root: Path | str | None = getattr(source, "root", None)  # generated images have none
+    if root is not None and not Path(root).is_dir():
+        raise UserError(f"there is no folder {root}: name that of the data with --root, or name photos or videos")
+    dataset = sources.open_dataset(source)
     if options.count < 1 or len(dataset) == 0:
         raise UserError(f"nothing to predict: {len(dataset)} images, --count {options.count}")
     indices = spread(len(dataset), options.count)
@@ -49,7 +54,11 @@ def predict_split(trained: Run, options: argparse.Namespace) -> int:
     names = [dataset.info(indices[row]).scene for row in rows]
     pictures = options.out / "pictures.png"
     save_road_images(pictures, examples, {title: answers}, titles=names, threshold=options.threshold)
-    print(f"{len(indices)} images written to {options.out}: predictions.json, truth.json, pictures.png")
+    lines = sum(len(row["lanes"]) for row in predictions)
+    found = f"{counted(len(indices), 'image')}, {counted(lines, 'lane line')} with a score of at least"
+    hint = "" if lines else " (choose a lower --threshold to see more)"
+    files = "predictions.json, truth.json, pictures.png"
+    print(f"{found} {options.threshold:g}{hint}; written to {options.out}: {files}")
     return 0
 
 

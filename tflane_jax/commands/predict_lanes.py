@@ -46,6 +46,7 @@ from tflane_jax.evaluation.predict import predict_examples
 from tflane_jax.files.atomic import replacing, write_json
 from tflane_jax.plots import save_camera_views, save_examples
 from tflane_jax.plots.segments import true_lanes
+from tflane_jax.plots.tables import counted
 from tflane_jax.runs import Run
 from tflane_jax.scene import Example, LinePrediction, SegmentPrediction
 from tflane_jax.tasks import spread
@@ -127,7 +128,10 @@ def predict(trained: Run, options: argparse.Namespace) -> int:
             threshold=options.threshold,
         )
         written.append("cameras.png")
-    print(f"{len(indices)} frames written to {options.out}: {', '.join(written)}")
+    lanes_found = sum(len(frame["lanes"]) for frame in frames)
+    found = f"{counted(len(indices), 'frame')}, {counted(lanes_found, 'lane')} with a score of at least"
+    best = "" if lanes_found else f" (best {scores.max(initial=0.0):.2g}: choose a lower --threshold to see it)"
+    print(f"{found} {options.threshold:g}{best}; written to {options.out}: {', '.join(written)}")
     return 0
 
 

@@ -31,6 +31,7 @@ from tflane_jax.files.images import PHOTO_SUFFIXES, list_photos, opencv, read_im
 from tflane_jax.files.videos import VIDEO_SUFFIXES, read_frames, sample_frames, video_info, writing_video
 from tflane_jax.plots.figure import new_figure
 from tflane_jax.plots.images import lanes_drawn, save_photo
+from tflane_jax.plots.tables import counted
 from tflane_jax.progress import progress_bar
 from tflane_jax.runs import Run
 from tflane_jax.tasks.photo_lanes import PhotoLanes, PhotoReader
@@ -72,8 +73,11 @@ def predict(trained: Run, paths: list[Path], options: argparse.Namespace) -> int
         if record["warning"]:
             print(f"tflane: {record['file']}: {record['warning']}", file=sys.stderr)
     lanes = sum(len(record["lanes"]) for record in records)
-    found = [f"{lanes} lane lines in {len(records)} photos"] * bool(records)
-    found += [f"{sum(map(len, clip['frames']))} in {len(clip['frames'])} frames of {clip['file']}" for clip in clips]
+    found = [f"{counted(lanes, 'lane line')} in {counted(len(records), 'photo')}"] * bool(records)
+    found += [
+        f"{sum(map(len, clip['frames']))} in {counted(len(clip['frames']), 'frame')} of {clip['file']}"
+        for clip in clips
+    ]
     if found:
         print(f"{'; '.join(found)}; pictures and predictions.json written to {options.out}")
     for fault in faults:
@@ -110,7 +114,7 @@ def _photo(reader: PhotoReader, path: Path, out: Path, camera: PhotoCamera | Non
     photo = read_image(path)
     answer = reader.read(photo, camera)
     count = len(answer.lanes)
-    save_photo(out, photo, answer.lanes, f"{path.name}: {count} lane line{'' if count == 1 else 's'}")
+    save_photo(out, photo, answer.lanes, f"{path.name}: {counted(count, 'lane line')}")
     height, width = photo.shape[:2]
     size = {"file": str(path), "width": width, "height": height}
     found = {"view": _plain_view(answer.view), "value": round(answer.value, 3), "warning": answer.warning}

@@ -10,7 +10,8 @@ from typing import Any
 
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import check_stem
-from tflane_jax.plots.tables import format_table, save_table
+from tflane_jax.plots.tables import format_table, save_table, written_to
+from tflane_jax.scoring import remarks as about
 from tflane_jax.scoring.protocols import ScoringProtocol, find_protocol
 from tflane_jax.scoring.scenes import read_scenes, scene_names
 from tflane_jax.scoring.score import Scored, check_bootstrap, score
@@ -35,6 +36,8 @@ def run(options: argparse.Namespace) -> int:
     groups = None if grouping is None else _scored(files, lambda: score(predictions, truth, grouping, scene_of)).total()
     scored = _scored(files, lambda: score(predictions, truth, protocol.metrics, scene_of))
     remarks = protocol.remarks(predictions, truth)
+    if protocol.found and not remarks:  # which may be the reason
+        remarks += about.nothing_near(predictions, truth, scored.total().get(protocol.found), protocol.frame)
     if options.bootstrap and protocol.no_scenes and named is None:
         remarks.append(f"{protocol.no_scenes}: the intervals are too narrow (name the drives by --scenes FILE)")
     for remark in remarks:
@@ -56,7 +59,7 @@ def run(options: argparse.Namespace) -> int:
         "remarks": remarks,
     }
     paths = save_table(options.out, rows, meta, columns=shown, title=title, digits=4)
-    print(f"\nwritten to {paths[0]} and {paths[1]}")
+    print(f"\n{written_to(paths)}")
     return 0
 
 

@@ -11,7 +11,7 @@ from tflane_jax.config_overrides import apply_overrides
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import check_stem
 from tflane_jax.plan import make_plan
-from tflane_jax.plots.tables import format_table, save_table
+from tflane_jax.plots.tables import format_table, save_table, written_to
 from tflane_jax.summary import parameter_counts, prediction_program, shapes_of_params, training_program
 from tflane_jax.training.runtime import configure_jax
 
@@ -57,7 +57,7 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> int:
     print("\n" + format_table(rows, title=title, digits=1))
     if options.out is not None:
         meta = {"config": options.config, "parameters": counts}
-        print(f"\nwritten: {save_table(options.out, rows, meta, title=title, digits=1)[0]}")
+        print(f"\n{written_to(save_table(options.out, rows, meta, title=title, digits=1))}")
     return 0
 
 
@@ -97,5 +97,5 @@ def _plan(options: argparse.Namespace, config: RunConfig, example: Any) -> int:
     print("\nAssumptions\n" + "\n".join(f"- {sentence}" for sentence in plan.assumptions))
     if options.out is not None:
         meta = {"config": options.config, "assumptions": plan.assumptions}
-        print(f"\nwritten: {save_table(options.out, plan.rows, meta, title=title)[0]}")
+        print(f"\n{written_to(save_table(options.out, plan.rows, meta, title=title))}")
     return 0

@@ -77,7 +77,10 @@ def _config(options: argparse.Namespace, out: Path, overrides: Sequence[str]) ->
         with processes.agreed():
             return apply_overrides(load_config(options.config), overrides)
     if overrides:
-        raise UserError(f"a run is resumed with its own configuration: leave {overrides[0]} out")
+        raise UserError(
+            f"a run is resumed with its own configuration: leave {overrides[0]} out (to train longer, or with "
+            f"other settings, start another run with --training.init-from {out})"
+        )
     return from_json(RunConfig, processes.from_first(lambda: to_json(resumable_config(out))))
 
 

@@ -62,7 +62,7 @@ def find_weights(path: Path) -> tuple[Path, PublishedFile | None]:
                 return file, published
     raise UserError(
         f"the weights {path} ({' or '.join(published.files)}) are not in {', '.join(map(str, folders))}: download "
-        f"{published.url} ({published.licence}) to the last of these folders, or name its folder in TFLANE_WEIGHTS. "
+        f"{published.url} ({published.licence}) into {folders[-1]}, or name its folder in TFLANE_WEIGHTS. "
         f"The sha256 of its tensors, which is checked, is {published.digest}"
     )
 

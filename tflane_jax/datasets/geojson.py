@@ -2,7 +2,8 @@
 
 A line's category is its property `category`, one of the names of `CATEGORIES`, or follows from its OpenStreetMap tag
 `highway` (`HIGHWAYS`; values that are not listed there are "other", and of several the first that is listed counts). A
-property that is null is none: exports of a table fill in what a feature does not have. Points and polygons are ignored.
+property that is null is none: exports of a table fill in what a feature does not have. Points and polygons are
+ignored, and lines that have neither property are left out: exports also contain rivers, buildings and power lines.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ import numpy as np
 from jaxtyping import Float
 
 from tflane_jax.datasets.base import TruncationWarning
-from tflane_jax.errors import UserError
+from tflane_jax.errors import LeftOutWarning, UserError
 from tflane_jax.files.fields import load_json, shown
 from tflane_jax.scene import SdCategory, SdMap
 from tflane_jax.world.roads.sd_map import SdMapConfig, pack_lines
@@ -58,6 +59,8 @@ HIGHWAYS = {
 }
 _LINES = {"LineString": 1, "MultiLineString": 2}
 _OTHERS = ("Point", "MultiPoint", "Polygon", "MultiPolygon", "GeometryCollection")
+# Distance, metres, beyond which the nearest road is no road of the vehicle's surroundings.
+_ELSEWHERE = 1e5
 # WGS84: semi-major axis, metres, and squared eccentricity.
 _AXIS, _ECCENTRICITY = 6_378_137.0, 6.694379990141e-3
 
@@ -90,13 +93,14 @@ class RoadLines:
 
 
 def read_geojson(path: str | Path) -> RoadLines:
-    """Read the lines of a FeatureCollection.
+    """Read the lines of a FeatureCollection. Warns (`LeftOutWarning`) of lines without a category, which are left out.
 
     Raises:
-        UserError: the file is no GeoJSON in WGS84, a line has no category, or its coordinates are not on Earth. The
-            message names the file, the feature (by its number, from 0, and its id) and the remedy.
+        UserError: the file is no GeoJSON in WGS84, no line has a category, one has an unknown category, or coordinates
+            are not on Earth. The message names the file, the feature (by its number, from 0, and its id) and the
+            remedy.
     """
-    lines, category = [], []
+    lines, category, others = [], [], []
     for name, feature in read_features(Path(path)):
         geometry = feature.get("geometry")
         if geometry is None:
@@ -106,9 +110,20 @@ def read_geojson(path: str | Path) -> RoadLines:
             if kind not in _OTHERS:
                 raise UserError(f"{name} has a geometry of type {shown(kind)}: export roads as LineString")
             continue
+        label = _category(feature.get("properties"), name)
+        if label is None:
+            others.append(name)
+            continue
         found = line_coordinates(geometry.get("coordinates"), _LINES[kind], name)
         lines += found
-        category += [_category(feature.get("properties"), name)] * len(found)
+        category += [label] * len(found)
+    neither = "neither of the properties `highway` and `category`"
+    if others and not lines:
+        raise UserError(f"{others[0]} has {neither}, and no other line has: add one of them to the roads")
+    if others:
+        known = len(others) + len(lines)
+        message = f"{len(others)} of {known} lines have {neither} and are left out, the first: {others[0]}"
+        warnings.warn(message, LeftOutWarning, stacklevel=2)
     return RoadLines(tuple(lines), tuple(category))
 
 
@@ -117,8 +132,17 @@ def sd_map_around(roads: RoadLines, origin: Origin, config: SdMapConfig) -> SdMa
 
     Only `lines`, `points` and `range` of the config are used: a real map has real faults, so none are simulated. Warns
     (`TruncationWarning`) if more lines are in range than the capacity.
+
+    Raises UserError if every road is more than 100 km away: then longitude and latitude are swapped, or it is the map
+    of another place.
     """
     lines = [to_ego(line, origin) for line in roads.lines]
+    nearest = min((float(np.linalg.norm(line, axis=-1).min()) for line in lines), default=0.0)
+    if nearest > _ELSEWHERE:
+        raise UserError(
+            f"the nearest road is about {nearest / 1000:,.0f} km from the origin (latitude {origin.latitude:g}, "
+            f"longitude {origin.longitude:g}): are longitude and latitude swapped?"
+        )
     sd_map, dropped = pack_lines(
         lines, roads.category, capacity=config.lines, points=config.points, range_=config.range
     )
@@ -186,7 +210,8 @@ def line_coordinates(coordinates: Any, depth: int, name: str) -> list[np.ndarray
     return lines
 
 
-def _category(properties: Any, name: str) -> int:
+def _category(properties: Any, name: str) -> int | None:
+    """Return the category of a line, None where neither property says it."""
     properties = properties if isinstance(properties, dict) else {}
     named, tag = properties.get("category"), properties.get("highway")
     if named is not None:
@@ -194,9 +219,7 @@ def _category(properties: Any, name: str) -> int:
             raise UserError(f"{name} has the category {shown(named)}: choose one of {', '.join(CATEGORIES)}")
         return CATEGORIES[named]
     if tag is None:
-        raise UserError(
-            f"{name} has neither of the properties `highway` and `category`: add one, or keep only roads in the file"
-        )
+        return None
     # Roads that a tool has joined have several values, as a list or with semicolons between them.
     values = tag if isinstance(tag, list) else str(tag).split(";")
     known = [HIGHWAYS.get(str(value).strip().removesuffix("_link")) for value in values]

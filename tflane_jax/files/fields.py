@@ -19,6 +19,7 @@ from tflane_jax.errors import UserError
 from tflane_jax.files.plain_pickle import load_plain_pickle
 
 _SPACE = re.compile(r"[ \t\n\r]*")
+PICKLE_SUFFIXES = (".pkl", ".pickle")
 _FARTHEST = 1e5
 """Largest coordinate of a line, metres in the vehicle's frame."""
 _MOST, _DEEPEST = 10_000_000, 32
@@ -32,7 +33,7 @@ def load_file(path: Path) -> Any:
     """
     if path.suffix == ".json":
         return parse_json(read_text(path), str(path), once=True)
-    if path.suffix in (".pkl", ".pickle"):
+    if path.suffix in PICKLE_SUFFIXES:
         return load_plain_pickle(path)
     raise UserError(f"{path}: expected a .json or .pkl file")
 
@@ -326,6 +327,7 @@ def shown(value: Any) -> str:
 
     Python refuses to write integers of more than 4300 digits, alone or in a list.
     """
+    value = value.item() if isinstance(value, np.generic) else value
     if isinstance(value, int) and abs(value) >= 2**63:
         return "an integer of many digits"
     try:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import os
 import stat
+import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from types import ModuleType
@@ -16,9 +17,10 @@ from types import ModuleType
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from tflane_jax.errors import UserError, missing_extra
+from tflane_jax.errors import LeftOutWarning, UserError, missing_extra
 
-PHOTO_SUFFIXES = (".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp")
+PHOTO_SUFFIXES = (".bmp", ".gif", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp")
+_NAMED = 3  # files in a message
 
 
 def opencv() -> ModuleType:
@@ -47,17 +49,19 @@ def quiet_opencv() -> Iterator[ModuleType]:
 def list_photos(paths: Iterable[Path], suffixes: tuple[str, ...] = PHOTO_SUFFIXES) -> list[Path]:
     """Return the files among `paths` as they are, and for each folder the photos directly in it, sorted by name.
 
-    Photos are files with one of the suffixes.
+    Photos are files with one of the suffixes. Warns (`LeftOutWarning`) of others in a folder, but for hidden ones.
 
     Raises UserError for a path that does not exist, a folder without photos, or no paths at all.
     """
     photos = []
     for path in map(Path, paths):
         if path.is_dir():
-            inside = sorted(p for p in path.iterdir() if p.suffix.lower() in suffixes and p.is_file())
+            files = sorted(p for p in path.iterdir() if p.is_file() and not p.name.startswith("."))
+            inside = [p for p in files if p.suffix.lower() in suffixes]
             if not inside:
                 raise UserError(f"folder {path} holds no photo (looked for {', '.join(suffixes)})")
             photos += inside
+            _warn_of_others(path, [p.name for p in files if p.suffix.lower() not in suffixes], len(files))
         elif path.exists():
             photos.append(path)
         else:
@@ -65,6 +69,13 @@ def list_photos(paths: Iterable[Path], suffixes: tuple[str, ...] = PHOTO_SUFFIXE
     if not photos:
         raise UserError("no photos given: name image files or folders of them")
     return photos
+
+
+def _warn_of_others(folder: Path, names: Sequence[str], count: int) -> None:
+    if names:
+        shown = ", ".join(names[:_NAMED]) + (", ..." if len(names) > _NAMED else "")
+        message = f"{len(names)} of {count} files in {folder} have no photo's suffix and are left out: {shown}"
+        warnings.warn(message, LeftOutWarning, stacklevel=3)
 
 
 def unreadable(path: Path) -> str | None:
@@ -104,6 +115,17 @@ def read_image(path: Path) -> UInt8[np.ndarray, "h w 3"]:
             f"{path} is damaged or no image of a known format: open it in an image viewer and save it as JPEG or PNG"
         )
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+
+
+def check_centre(path: Path, image: UInt8[np.ndarray, "h w 3"], intrinsics: Float[np.ndarray, "3 3"]) -> None:
+    """Raise UserError if the principal point is outside an image, which then has another size than the calibration."""
+    height, width = image.shape[:2]
+    x, y = intrinsics[:2, 2]
+    if not (0.0 <= x <= width and 0.0 <= y <= height):
+        raise UserError(
+            f"{path} is {width} x {height}, but the principal point is ({x:g}, {y:g}): are the intrinsics of another "
+            "image size?"
+        )
 
 
 def undistorted(

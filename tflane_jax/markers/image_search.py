@@ -7,19 +7,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from tflane_jax.files.images import opencv
-from tflane_jax.limits import Count, CountOrZero, Fraction, Positive, check_settings
+from tflane_jax.limits import Count, CountOrZero, Fraction, Limit, Positive, check_settings
 from tflane_jax.markers.corner_refinement import refine_corners
 from tflane_jax.markers.occluded_search import find_occluded
-from tflane_jax.scene.marker_patterns import MarkerFamily, dictionary_of, marker_cells
+from tflane_jax.scene.marker_patterns import BOARD_SIZES, MarkerFamily, dictionary_of, marker_cells
 
 # Window widths of OpenCV's adaptive threshold, pixels: its defaults.
 _WINDOWS = (3, 13, 23)
+_LEAST, _MOST = BOARD_SIZES
+_BOARD_SIZE = Limit(f"from {_LEAST:g} to {_MOST:g} metres", lambda value: _LEAST <= value <= _MOST)
 
 
 @dataclass(frozen=True)
@@ -28,7 +30,7 @@ class DetectorConfig:
 
     Attributes:
         family: dictionary of the markers.
-        size: side of the black square, metres.
+        size: side of the black square, metres, as of a store's markers.
         capacity: most markers reported per frame; the best scores are kept.
         corners: "pattern" fits all printed cells to the image, "subpixel" refines each corner separately, "none" keeps
             the pixels of the outline.
@@ -45,7 +47,7 @@ class DetectorConfig:
     """
 
     family: MarkerFamily = MarkerFamily.ARUCO_5X5_100
-    size: Positive = 1.0
+    size: Annotated[float, _BOARD_SIZE] = 1.0
     capacity: Count = 16
     corners: Literal["pattern", "subpixel", "none"] = "pattern"
     enlarge: Count = 1

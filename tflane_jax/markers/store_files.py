@@ -19,6 +19,7 @@ from tflane_jax.files.atomic import write_text
 from tflane_jax.files.fields import items, member, numbers, parse_json, read_text, shown, whole_number
 from tflane_jax.geometry import invert_pose, transform_points
 from tflane_jax.markers.store import MarkerStore, StoredMarker
+from tflane_jax.scene.marker_patterns import BOARD_SIZES
 
 FORMAT, VERSION = "tflane-marker-store", 1
 # Length units that a file may be in, metres.
@@ -28,8 +29,8 @@ _DECIMALS = 3
 _LARGEST_ID = 2**31 - 1
 # Lanes of a marker; their successors take memory of its square. In range of a marker are at most a few dozen.
 _MOST_LANES = 1000
-# Limits of lengths, metres: side of a square, coordinates of a map, distance of a lane from its marker.
-_SIZES, _MAP, _LANES = (0.01, 100.0), 1e8, 1e5
+# Limits of lengths, metres: coordinates of a map, distance of a lane from its marker.
+_MAP, _LANES = 1e8, 1e5
 
 
 def save_store(store: MarkerStore, path: Path, *, frame: Literal["marker", "survey"] = "marker") -> Path:
@@ -107,8 +108,8 @@ def _read_marker(entry: Any, number: int, unit: float, frame: str, where: str) -
     if isinstance(side, bool):
         raise UserError(f"{where}: size is {side}, expected a number")
     size = unit * float(numbers(side, (), f"{where}: size"))
-    if not _SIZES[0] <= size <= _SIZES[1]:
-        raise UserError(f"{where}: size is {size:g} m, expected {_SIZES[0]:g} to {_SIZES[1]:g} m")
+    if not BOARD_SIZES[0] <= size <= BOARD_SIZES[1]:
+        raise UserError(f"{where}: size is {size:g} m, expected {BOARD_SIZES[0]:g} to {BOARD_SIZES[1]:g} m")
     listed = items(entry, "lanes", where)
     if len(listed) > _MOST_LANES:
         raise UserError(f"{where}: lanes has {len(listed)} entries, expected at most {_MOST_LANES} around a marker")

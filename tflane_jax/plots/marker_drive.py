@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
+from scipy.special import expit
 
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.geometry.cameras import project
@@ -31,6 +32,8 @@ if TYPE_CHECKING:
 _CAMERAS, _PIXELS = 3, 900
 # A board narrower than this fraction of the image is magnified.
 _SMALL = 0.1
+# Size of labels, points; half the length and height of one, as a fraction of the panel's width.
+_FONT, _LABEL = 6, np.array([0.06, 0.016])
 # Boards by what became of them; lanes of a marker from no to full confidence.
 OUTCOMES: dict[Outcome, str] = {
     "used": "#34c759",
@@ -89,12 +92,18 @@ def save_drive_frame(
     draw_guidance(above, guidance)
     if prediction is not None:
         draw_prediction(above, prediction, threshold=threshold)
+    drawn = [np.zeros((1, 2)), *(line[:, :2] for line in _lanes(guidance)[0])]  # the ego vehicle, and lanes
+    if prediction is not None:
+        drawn += [
+            line[:, :2]
+            for line in np.asarray(prediction.points)[expit(np.asarray(prediction.logits)).max(-1) >= threshold]
+        ]
     for k in np.flatnonzero(detected.valid).tolist():
         number = int(detected.marker_id[k])
         x, y = detected.pose[k, :2, 3].tolist()
         above.plot([x], [y], "s", color=OUTCOMES[outcomes[number]], markersize=6, zorder=6.0)
-        if view.contains(np.array([x, y])):  # beside the board, towards the middle
-            side, up = (-1 if x > np.mean(view.x) else 1), (-1 if y > np.mean(view.y) else 1)
+        if view.contains(np.array([x, y])):
+            side, up = _free_side(np.array([x, y]), drawn, view)
             above.annotate(
                 _label(number, outcomes, confidence),
                 (x, y),
@@ -103,8 +112,9 @@ def save_drive_frame(
                 ha="left" if side > 0 else "right",
                 va="bottom" if up > 0 else "top",
                 color=OUTCOMES[outcomes[number]],
-                fontsize=6,
-                zorder=6.1,
+                fontsize=_FONT,
+                path_effects=_outlined(),
+                zorder=6.3,  # above the ego vehicle
             )
     draw_ego(above)
     return save_figure(figure, path)
@@ -231,7 +241,42 @@ def _draw_board(
     ax.plot(*np.concatenate([outline, outline[:1]]).T, color=colour, linewidth=1.2, zorder=4.0)
     foot = project(pose[None, :3, 3] - [0.0, 0.0, float(detected.size[k])], intrinsics, camera_from_ego)[0][0]
     label = _label(marker, outcomes, confidence)
-    ax.annotate(label, foot, color=colour, fontsize=6, ha="center", va="top", zorder=4.1, clip_on=True)
+    ax.annotate(
+        label,
+        foot,
+        color=colour,
+        fontsize=_FONT,
+        ha="center",
+        va="top",
+        path_effects=_outlined(),
+        zorder=4.1,
+        clip_on=True,
+    )
+
+
+def _outlined() -> list[Any]:
+    """Return the dark outline with which a label can be read on lanes, paint and vehicles."""
+    from matplotlib.patheffects import withStroke
+
+    return [withStroke(linewidth=1.6, foreground=style.ROAD)]
+
+
+def _free_side(
+    place: Float[np.ndarray, " 2"], drawn: Sequence[Float[np.ndarray, "n 2"]], view: PerceptionRange
+) -> tuple[int, int]:
+    """Return on which sides of a board, -1 or 1 along x and y, its label is farthest from lines and in the panel."""
+    low, high = np.array([view.x, view.y]).T
+    half = _LABEL * (high[0] - low[0])
+    points = np.concatenate(drawn)
+    inwards = np.where(place > 0.5 * (low + high), -1, 1)  # first, so that it is taken where all are as free
+    best, most = (int(inwards[0]), int(inwards[1])), -1.0
+    for turn in ((1, 1), (-1, 1), (1, -1), (-1, -1)):
+        side = inwards * turn
+        middle = place + side * (half + 0.5 * half[1])
+        free = float(np.linalg.norm((points - middle) / half, axis=1).min())
+        if (middle - half >= low).all() and (middle + half <= high).all() and free > most:
+            best, most = (int(side[0]), int(side[1])), free
+    return best
 
 
 def _label(marker: int, outcomes: Mapping[int, Outcome], confidence: Mapping[int, float]) -> str:

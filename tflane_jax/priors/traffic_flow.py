@@ -93,8 +93,11 @@ def select_traffic_flow(
         forward: axis of the host's frame that points ahead: y in the axes of nuScenes' lidar.
 
     Raises:
-        ValueError: the traffic flow has fewer frames than the configuration.
+        ValueError: the traffic flow has fewer frames than the configuration, or is that of a batch.
     """
+    if flow.position.ndim != 3:
+        shape = tuple(flow.position.shape)
+        raise ValueError(f"position has shape {shape}, expected (K, N, 3): one frame; jax.vmap adds batches")
     xp = namespace(flow.position, flow.valid)
     recorded = flow.valid.shape[1]
     if recorded < config.frames:

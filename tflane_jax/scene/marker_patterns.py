@@ -32,6 +32,8 @@ class MarkerFamily(enum.Enum):
     APRILTAG_36H11 = "DICT_APRILTAG_36h11"
 
 
+BOARD_SIZES = (0.01, 100.0)
+"""Smallest and largest side of a marker's black square, metres."""
 # Width in cells of the white margin of a printed marker, which detectors need.
 MARGIN = 1
 

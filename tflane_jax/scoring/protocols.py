@@ -11,6 +11,7 @@ from typing import Any
 
 from tflane_jax.errors import UserError
 from tflane_jax.files import tusimple
+from tflane_jax.files.fields import PICKLE_SUFFIXES
 from tflane_jax.metrics.f_score import CenterlineFScore
 from tflane_jax.metrics.groups import ByDistance
 from tflane_jax.metrics.lane_segment import Flavour, GroupedSegmentMetrics, LaneSegmentMetrics
@@ -37,6 +38,8 @@ class ScoringProtocol:
         groups: by a criterion that partitions lanes, "occlusion" or "distance": returns a new accumulator whose numbers
             are by group.
         remarks: returns what is unusual, though not wrong, about predictions and truth.
+        found: that one of the numbers which is 0 exactly if no predicted line is near a true one; "" for none.
+        frame: axes, units and frame of the lines, or what else to look at, for a remark where none is near.
         no_scenes: why `scene_of` separates frames of one drive; "" if it does not.
     """
 
@@ -48,6 +51,8 @@ class ScoringProtocol:
     formats: tuple[Format, ...]
     groups: Mapping[str, Callable[[], Any]] = field(default_factory=dict)
     remarks: remarks.Remarks = remarks.no_remarks
+    found: str = ""
+    frame: str = "x forward, y left, z up, metres in the vehicle's frame"
     no_scenes: str = ""
 
     def read(self, predictions: Path, truth: Path) -> tuple[Mapping[Any, Any], Mapping[Any, Any]]:
@@ -64,7 +69,14 @@ class ScoringProtocol:
 
 
 def _plain_or(read_plain: Callable[[Path], Any], read_official: Callable[[Path], Any]) -> Callable[[Path], Any]:
-    return lambda path: (read_plain if path.suffix in plain.SUFFIXES else read_official)(path)
+    def read(path: Path) -> Any:
+        if path.suffix in plain.SUFFIXES:
+            return read_plain(path)
+        if path.suffix not in PICKLE_SUFFIXES and not path.is_dir():
+            raise UserError(f"{path}: expected a .pkl, .json or .npz file; docs/scoring.md says what it holds")
+        return read_official(path)
+
+    return read
 
 
 def _centerline(version: Version) -> ScoringProtocol:
@@ -76,6 +88,7 @@ def _centerline(version: Version) -> ScoringProtocol:
         columns=("OLS", "DET_l", "DET_t", "TOP_ll", "TOP_lt"),
         formats=("OpenLane-V2 centerlines", "plain centerlines"),
         remarks=remarks.centerlines,
+        found="recall",
         groups={
             "occlusion": partial(GroupedCenterlineMetrics, versions=(version,)),
             "distance": partial(GroupedCenterlineMetrics, partition=ByDistance(), versions=(version,)),
@@ -92,6 +105,7 @@ def _lane_segment(flavour: Flavour, columns: tuple[str, ...]) -> ScoringProtocol
         columns=(*columns, "AE_type", "AE_dist"),
         formats=("OpenLane-V2 lane segments",),
         remarks=remarks.segments,
+        found=columns[1],
         groups={
             "occlusion": partial(GroupedSegmentMetrics, flavour=flavour),
             "distance": partial(GroupedSegmentMetrics, partition=ByDistance(), flavour=flavour),
@@ -110,6 +124,8 @@ def _maptr(sampling: Sampling, measure: Measure = "chamfer", dims: Dims = 2) -> 
         columns=("mAP", *(f"AP_{name}" for name in LINE_CLASSES)),
         formats=("MapTR",),
         remarks=remarks.units,
+        found="mAP",
+        frame="and are the classes right",
         groups={"occlusion": grouped, "distance": partial(grouped, partition=ByDistance())},
     )
 
@@ -123,7 +139,7 @@ def _tusimple(time_limit: float) -> ScoringProtocol:
         metrics=partial(TuSimpleMetrics, time_limit),
         columns=("Accuracy", "FP", "FN"),
         formats=("TuSimple",),
-        remarks=remarks.rows,
+        remarks=partial(remarks.images, time_limit=time_limit),
     )
 
 
@@ -138,6 +154,7 @@ PROTOCOLS: dict[str, ScoringProtocol] = {
         columns=("F_score", "F_recall", "F_precision"),
         groups={},
         remarks=remarks.units,
+        found="F_recall",
     ),
     "maptr": _maptr("maptr"),
     "maptrv2": _maptr("maptrv2"),

@@ -105,7 +105,8 @@ def _of_record(record: Any) -> Content | None:
     if not isinstance(record, Mapping):
         return None
     if "raw_file" in record:
-        return Content("TuSimple", "predictions" if "run_time" in record else "ground truth")
+        labelled = "h_samples" in record and "run_time" not in record
+        return Content("TuSimple", "ground truth" if labelled else "predictions")
     if "GTs" in record:
         return Content("MapTR", "ground truth")
     if "annotation" in record:

@@ -12,6 +12,7 @@ from tflane_jax.files.tusimple import RowLanes
 from tflane_jax.metrics.frames import LaneDetections, LaneTruth, Lines
 from tflane_jax.metrics.map_matching import MapDetections, MapTruth
 from tflane_jax.metrics.segment_matching import SegmentDetections, SegmentTruth
+from tflane_jax.metrics.tusimple import LSTR_TIME_LIMIT
 from tflane_jax.scoring.openlane_v2 import AREA_POINTS, CENTERLINE_POINTS, LINE_POINTS
 
 Remarks = Callable[[Mapping[Any, Any], Mapping[Any, Any]], list[str]]
@@ -55,8 +56,39 @@ def segments(predictions: Mapping[Any, SegmentDetections], truth: Mapping[Any, S
     return [*(remark for remarks in counts for remark in remarks), *areas, *units]
 
 
-def rows(predictions: Mapping[Any, RowLanes], truth: Mapping[Any, RowLanes]) -> list[str]:
-    """Return a remark on labels at other rows than TuSimple's."""
+def images(predictions: Mapping[Any, RowLanes], truth: Mapping[Any, RowLanes], time_limit: float) -> list[str]:
+    """Return remarks on images that took longer than the limit (milliseconds), and on labels at other rows."""
+    return [*_slow(predictions, time_limit), *_other_rows(truth)]
+
+
+def nothing_near(
+    predictions: Mapping[Any, Any], truth: Mapping[Any, Any], score: float | None, frame: str
+) -> list[str]:
+    """Return a remark where lines are predicted, but none is near a true one.
+
+    Args:
+        predictions, truth: by frame; lanes, segments or lines of a map.
+        score: one over all frames that is 0 exactly if no line is found.
+        frame: axes, units and frame of the lines, or what else to look at, in words.
+    """
+    both = [any(len(getattr(one, "lanes", one).points) for one in side.values()) for side in (predictions, truth)]
+    if score != 0.0 or not all(both):
+        return []
+    return [f"no predicted line is near a true one: are axes, units and frame those of the ground truth, {frame}?"]
+
+
+def _slow(predictions: Mapping[Any, RowLanes], time_limit: float) -> list[str]:
+    slow = [key for key, one in predictions.items() if one.run_time > time_limit]
+    if not slow:
+        return []
+    lenient = f"; tusimple-lstr allows {LSTR_TIME_LIMIT / 1000:g} s" if time_limit < LSTR_TIME_LIMIT else ""
+    return [
+        f"{len(slow)} of {len(predictions)} images took longer than {time_limit:g} ms and count as without lanes, by "
+        f"TuSimple's rule ({_named(slow)}){lenient}"
+    ]
+
+
+def _other_rows(truth: Mapping[Any, RowLanes]) -> list[str]:
     other = [key for key, one in truth.items() if one.rows is not None and not np.isin(one.rows, ROWS).all()]
     if not other:
         return []

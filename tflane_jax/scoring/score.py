@@ -138,8 +138,27 @@ def _check_frames(predictions: Mapping[Hashable, Any], truth: Mapping[Hashable, 
             shown = ", ".join(f"{name:.80}" for name in sorted(map(str, lost))[:3])
             more = f" and {len(lost) - 3} more" if len(lost) > 3 else ""
             problems.append(f"{len(lost)} of {len(ours)} frames are {what}: {shown}{more} ({remedy})")
+    if prefix := _prefix(predictions, truth):
+        raise UserError(f"the predictions name frames with {prefix}, the ground truth without: take it off")
+    if prefix := _prefix(truth, predictions):
+        raise UserError(f"the ground truth names frames with {prefix}, the predictions without: put it before them")
     if problems:
         raise UserError("; ".join(problems))
+
+
+def _prefix(ours: Mapping[Hashable, Any], other: Mapping[Hashable, Any]) -> str:
+    """Return by what in front, in words, all names of `ours` differ from those of `other`; "" if not only by that."""
+    if not all(isinstance(name, str) for name in (*ours, *other)) or ours.keys() <= other.keys():
+        return ""
+    names = [str(name).replace("\\", "/") for name in ours]
+    end = next((name for name in other if f"/{names[0]}".endswith(f"/{name}")), None)
+    if end is None:
+        return ""
+    before = names[0].removesuffix(str(end))
+    if not all(name.startswith(before) and name.removeprefix(before) in other for name in names):
+        return ""
+    slashes = "backslashes" if any("\\" in str(name) for name in ours) else ""
+    return " and ".join(filter(None, [f"the prefix {before}" if before else "", slashes]))
 
 
 def _merged(accumulators: list[Accumulator]) -> Accumulator:

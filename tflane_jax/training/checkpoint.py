@@ -135,7 +135,11 @@ class Checkpoints:
         """Return the step of a checkpoint; raises UserError, with a list of those that exist, if there is none."""
         steps = self.steps()
         if not steps and not (run := self.folder.parent).joinpath("config.json").exists():
-            raise UserError(f"{run} is no run folder: it has no config.json, and {self.folder} holds no checkpoint")
+            inside = [str(path.parent) for path in sorted(run.glob("*/config.json"))[:3]]
+            hint = f"; did you mean {' or '.join(inside)}?" if inside else ""
+            raise UserError(
+                f"{run} is no run folder: it has no config.json, and {self.folder} holds no checkpoint{hint}"
+            )
         if not steps:
             raise UserError(f"{self.folder} holds no checkpoint: the run ended before its first one was written")
         step = steps[-1] if which == "last" else self.best_step() if which == "best" else which

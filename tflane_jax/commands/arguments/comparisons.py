@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from tflane_jax.commands.arguments.shared import OVERRIDES, command
+from tflane_jax.commands.arguments.shared import OVERRIDES, command, stem
 
 _FILES = """Protocols and their files:
   openlane-v2.1-centerline, openlane-v1.0-centerline
@@ -226,7 +226,7 @@ def score(commands) -> None:
         help='scene of each frame, {"frame": "scene"} or nuScenes\' sample.json, for files that do not name it',
     )
     parser.add_argument(
-        "--out", metavar="STEM", type=Path, default=Path("score"), help="write STEM.md and STEM.json (default score)"
+        "--out", metavar="STEM", type=stem, default=Path("score"), help="write STEM.md and STEM.json (default score)"
     )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from tflane_jax.commands.arguments.shared import OVERRIDES, SourceName, command, source_arguments, split_arguments
+from tflane_jax.commands.arguments.shared import OVERRIDES, SourceName, command, source_arguments, split_arguments, stem
 
 
 def data(commands) -> None:
@@ -41,7 +41,7 @@ def data(commands) -> None:
         default=[],
         help="also count these data and compare the distributions; PATH is their folder. May be repeated",
     )
-    stats.add_argument("--out", metavar="STEM", type=Path, help="with --beside: write STEM.md, STEM.json and STEM.png")
+    stats.add_argument("--out", metavar="STEM", type=stem, help="with --beside: write STEM.md, STEM.json and STEM.png")
     stats.set_defaults(takes_overrides=True)
     check = command(
         inner, "check", "count the content of a dataset's folder and list its faults", module="data", function="check"
@@ -118,7 +118,7 @@ def data(commands) -> None:
         "train", metavar="TRAIN", type=Path, help="folder of Argoverse 2 logs, or of OpenLane-V2 segments"
     )
     overlap.add_argument("validation", metavar="VALIDATION", type=Path, help="the same for the validation split")
-    overlap.add_argument("--out", metavar="STEM", type=Path, help="write STEM.md and STEM.json")
+    overlap.add_argument("--out", metavar="STEM", type=stem, help="write STEM.md and STEM.json")
     build = command(
         inner,
         "build",

@@ -4,7 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from tflane_jax.commands.arguments.shared import OVERRIDES, command, example_arguments, model_arguments, split_arguments
+from tflane_jax.commands.arguments.shared import (
+    OVERRIDES,
+    command,
+    example_arguments,
+    model_arguments,
+    split_arguments,
+    stem,
+)
 
 _PREDICT = """Lane lines in photos and videos of any size:
   tflane predict RUN photo.jpg drive.mp4 folder/                     with a model trained by tflane
@@ -75,7 +82,7 @@ def evaluate(commands) -> None:
         "(default: the configuration's)",
     )
     parser.add_argument(
-        "--out", metavar="STEM", type=Path, help="write STEM.md and STEM.json (default RUN/evaluations/<split>...)"
+        "--out", metavar="STEM", type=stem, help="write STEM.md and STEM.json (default RUN/evaluations/<split>...)"
     )
 
 
@@ -180,7 +187,9 @@ def summary(commands) -> None:
     )
     parser.add_argument("--config", metavar="FILE[:NAME]", help="config file (default: the default configuration)")
     parser.add_argument("--depth", type=int, help="levels of parameter names in the table (default 1)")
-    parser.add_argument("--no-compile", action="store_true", help="count operations only, which takes seconds")
+    parser.add_argument(
+        "--no-compile", action="store_true", help="count operations only: up to a minute or two at the papers' sizes"
+    )
     parser.add_argument("--no-training", action="store_true", help="omit the training step")
     parser.add_argument(
         "--plan", metavar="DEVICES", type=int, help="estimate memory and time of the training on so many accelerators"
@@ -190,5 +199,5 @@ def summary(commands) -> None:
     parser.add_argument(
         "--utilisation", type=float, help="with --plan: fraction of the peak that is assumed (default 0.25)"
     )
-    parser.add_argument("--out", metavar="STEM", type=Path, help="write STEM.md and STEM.json")
+    parser.add_argument("--out", metavar="STEM", type=stem, help="write STEM.md and STEM.json")
     parser.set_defaults(takes_overrides=True)

@@ -65,6 +65,12 @@ def command(commands, name: str, text: str, *, function: str, module: str, epilo
     return parser
 
 
+def stem(text: str) -> Path:
+    """Return the STEM of STEM.md and STEM.json, which may be given with either suffix."""
+    path = Path(text)
+    return path.with_suffix("") if path.suffix.lower() in (".md", ".json") else path
+
+
 def _checkpoint(text: str) -> int | str:
     if text in ("best", "last"):
         return text

@@ -204,7 +204,7 @@ def test_check_lists_damaged_files(tmp_path, capsys):
     assert main(["data", "check", "--format", "nuscenes-scenes", str(tmp_path)]) == 2
     text = capsys.readouterr().out
     assert "| a     |          3 |          1 |     2 |        2 |          1 |" in text
-    assert "1 faults" in text
+    assert "1 fault:" in text
     assert "b.npz: ego_yaw holds nan" in text
 
 

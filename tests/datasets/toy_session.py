@@ -78,7 +78,7 @@ def commands(data: Path, folder: Path) -> None:
 
     (data / "test.txt").unlink()
     assert "test.txt is missing" in tflane("eval", str(run), *root, code=2)
-    assert "1 faults" in tflane("data", "check", "--format", "toy", str(data), code=2)
+    assert "1 fault:" in tflane("data", "check", "--format", "toy", str(data), code=2)
     assert "needs --root PATH, the toy's folder" in tflane("eval", str(run), "--data", "toy", code=2)
 
 

@@ -11,8 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.models.cases import BASELINE
-from tests.models.test_marker_fusion import CONFIG, observed, same, seeing
+from tests.models.test_marker_fusion import CONFIG, observed, seeing
 from tests.parameters import random_params
+from tests.shared import assert_same
 from tflane_jax.geometry import BevGrid, relative_pose, yaw_pose
 from tflane_jax.models.marker_fusion import (
     FusedMarkers,
@@ -85,7 +86,7 @@ def test_without_markers_features_stay(variant):
             expected = nn.LayerNorm(epsilon=1e-5).apply({"params": params["markers_0"]["norm"]}, BEV)
             np.testing.assert_allclose(fuse(lanes), expected, atol=1e-6)
         else:
-            same(fuse(lanes), expected)
+            assert_same(fuse(lanes), expected)
     assert np.abs(fuse(lanes_of(config, observed())) - expected).max() > 1e-3
 
 
@@ -99,7 +100,7 @@ def test_padding_of_lanes_may_hold_nan(variant):
         confidence=jnp.where(gone, jnp.nan, lanes.confidence),
         successor=lanes.successor | (gone[:, None] & gone[None, :]),
     )
-    same(fuse(dirty), fuse(lanes))
+    assert_same(fuse(dirty), fuse(lanes))
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -12,6 +12,7 @@ import json
 import os
 import re
 import shutil
+import time
 import zlib
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -109,7 +110,7 @@ class Checkpoints:
             rename_flushed(writing, place)
             self._drop_old()
         except OSError as error:
-            shutil.rmtree(writing, ignore_errors=True)
+            _remove_unfinished(writing)
             raise UserError(
                 f"cannot write checkpoint {place}: {error.strerror or error}; make room or give the right to write "
                 "there, and go on from the checkpoint before with --resume"
@@ -229,6 +230,17 @@ class Checkpoints:
         others = [other for other in self.steps() if other != step]
         remedy = f"the run can go on from step {others[-1]}" if others else "there is no other: start the run again"
         return UserError(f"checkpoint {self.path(step)} is damaged ({why}): delete that folder; {remedy}")
+
+
+def _remove_unfinished(folder: Path) -> None:
+    """Delete what a failed write left; its threads may still be writing, and may make the folder anew."""
+    gone = 0
+    for _ in range(40):
+        shutil.rmtree(folder, ignore_errors=True)
+        time.sleep(0.05)
+        gone = 0 if folder.exists() else gone + 1
+        if gone == 3:
+            return
 
 
 def _sum_of(config: dict[str, Any]) -> int:

@@ -46,26 +46,25 @@ def test_the_label_of_a_board_lies_beside_it_and_in_the_panel(place, tmp_path, m
     assert outside.max() >= half
 
 
-@pytest.mark.parametrize(("y", "up"), [(5.0, True), (-5.0, False)])
-def test_the_label_of_a_board_lies_on_the_side_away_from_lanes_and_can_be_read_on_them(y, up, tmp_path, monkeypatch):
+def panel_from_above(place, guidance, folder, monkeypatch):
+    """Return the panel from above of a frame that detects board 98 at a place."""
     found = DetectedMarkers.empty(1)
-    found.valid[:], found.marker_id[:], found.size[:], found.pose[0, :2, 3] = True, 98, 1.0, (10.0, y)
-    lane = np.stack([np.linspace(0.0, 40.0, 21), np.zeros(21)], -1)[None]
-    guidance = MarkerGuidance(lane, np.ones(1), np.ones(1), np.ones(()), np.zeros((1, 1), bool), np.ones(1, bool))
-    views = CameraViews(
-        np.zeros((1, 48, 64, 3), np.uint8),
-        np.array([[64, 48]]),
-        np.eye(3)[None],
-        np.eye(4, dtype=np.float32)[None],
-        np.ones(1, bool),
-    )
+    found.valid[:], found.marker_id[:], found.size[:], found.pose[0, :2, 3] = True, 98, 1.0, place
+    image, matrix = np.zeros((1, 48, 64, 3), np.uint8), np.eye(4, dtype=np.float32)[None]
+    views = CameraViews(image, np.array([[64, 48]]), np.eye(3)[None], matrix, np.ones(1, bool))
     drawn = []
     monkeypatch.setattr(marker_drive, "save_figure", lambda figure, path: drawn.append(figure))
-    marker_drive.save_drive_frame(
-        tmp_path / "x.png", views, found, {98: "used"}, {98: 0.51}, guidance, view=PerceptionRange()
-    )
+    outcome, confidence = {98: "used"}, {98: 0.51}
+    marker_drive.save_drive_frame(folder / "x.png", views, found, outcome, confidence, guidance, view=PerceptionRange())
     drawn[0].draw_without_rendering()
-    panel = drawn[0].axes[1]
+    return drawn[0].axes[1]
+
+
+@pytest.mark.parametrize(("y", "up"), [(5.0, True), (-5.0, False)])
+def test_the_label_of_a_board_lies_on_the_side_away_from_lanes_and_can_be_read_on_them(y, up, tmp_path, monkeypatch):
+    lane = np.stack([np.linspace(0.0, 40.0, 21), np.zeros(21)], -1)[None]
+    guidance = MarkerGuidance(lane, np.ones(1), np.ones(1), np.ones(()), np.zeros((1, 1), bool), np.ones(1, bool))
+    panel = panel_from_above((10.0, y), guidance, tmp_path, monkeypatch)
     (label,) = (text for text in panel.texts if text.get_text() == "98: 0.51")
     box, board = label.get_window_extent(), panel.transData.transform((10.0, y))
     assert (box.y0 > board[1]) if up else (box.y1 < board[1])
@@ -73,18 +72,5 @@ def test_the_label_of_a_board_lies_on_the_side_away_from_lanes_and_can_be_read_o
 
 
 def test_boards_out_of_the_panel_have_no_label(tmp_path, monkeypatch):
-    found = DetectedMarkers.empty(1)
-    found.valid[:], found.marker_id[:], found.size[:], found.pose[0, :2, 3] = True, 98, 1.0, (70.0, 0.0)
-    views = CameraViews(
-        np.zeros((1, 48, 64, 3), np.uint8),
-        np.array([[64, 48]]),
-        np.eye(3)[None],
-        np.eye(4, dtype=np.float32)[None],
-        np.ones(1, bool),
-    )
-    drawn = []
-    monkeypatch.setattr(marker_drive, "save_figure", lambda figure, path: drawn.append(figure))
-    marker_drive.save_drive_frame(
-        tmp_path / "x.png", views, found, {98: "used"}, {98: 0.51}, NO_LANES, view=PerceptionRange()
-    )
-    assert [text.get_text() for text in drawn[0].axes[1].texts if "98" in text.get_text()] == []
+    panel = panel_from_above((70.0, 0.0), NO_LANES, tmp_path, monkeypatch)
+    assert [text.get_text() for text in panel.texts if "98" in text.get_text()] == []

@@ -216,7 +216,9 @@ def train(
             batch = next(feed, None)
         update: Any = None
         if batch is not None:  # a run that is complete has no next batch
-            form = UpdateForm(len(states) == 1, mesh, config.accumulate, config.shard_state)
+            form = UpdateForm(
+                donate=len(states) == 1, mesh=mesh, accumulate=config.accumulate, shard_state=config.shard_state
+            )
             update = compiled_update(task, optim, config.steps, states[0], batch[0], form)
         compile_seconds = time.perf_counter() - began
         ready()

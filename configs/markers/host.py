@@ -6,7 +6,7 @@
 Models, losses and optimizer are the recipe of docs/small_models.md (`tf_lane/toponet`, `tf_lane/lanesegnet`), with one
 more block after the U-Net, so that markers enter the BEV features before and after its context. The examples hold
 markers and an SD map, which the hosts ignore, so that models with priors use the same cached data. Boards stand at
-every approach of a junction and behind it, some six in a scene that has any; the paper has one in a scene.
+every approach of a junction and behind it, several in a scene; the paper has one in a scene.
 
 Four seeds, 4,000 updates, DET_l in percent (`tflane tables markers.1 --seeds 4`): TopoNet 30.8 ± 0.5, BEVFormer-DETR
 17.5 ± 0.2.

@@ -28,6 +28,7 @@ predictions.json, lanes with a score of at least `threshold`, best first:
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +40,8 @@ from scipy.special import expit
 from tflane_jax.commands.sources import limited_task, make_folder, source_for
 from tflane_jax.commands.views import with_images
 from tflane_jax.datasets import sources
-from tflane_jax.datasets.base import FrameInfo
+from tflane_jax.datasets.base import Dataset, FrameInfo
+from tflane_jax.datasets.data_source import LaneGraphSource
 from tflane_jax.datasets.procedural import SimulatedDataset
 from tflane_jax.errors import UserError
 from tflane_jax.evaluation.predict import predict_examples
@@ -48,7 +50,7 @@ from tflane_jax.plots import save_camera_views, save_examples
 from tflane_jax.plots.segments import true_lanes
 from tflane_jax.plots.tables import counted
 from tflane_jax.runs import Run
-from tflane_jax.scene import Example, LinePrediction, SegmentPrediction
+from tflane_jax.scene import Example, LinePrediction, Prediction, SegmentPrediction
 from tflane_jax.tasks import spread
 from tflane_jax.tasks.lane_pictures import Found, lanes_of, titles
 
@@ -69,17 +71,43 @@ def predict(trained: Run, options: argparse.Namespace) -> int:
         raise UserError(f"--cameras renders scenes of the built-in world, and {dataset.name} has none: leave it out")
     indices = spread(len(dataset), options.count)
     examples, answer = predict_examples(task, trained.params[0], dataset, indices)
-    lanes, elements = lanes_of(answer), answer.elements
     infos = [dataset.info(index) for index in indices]
-    points, scores = np.asarray(lanes.points), expit(lanes.logits).max(-1)
-    edges = None if isinstance(lanes, LinePrediction) else lanes.successor_logits
-    successor = np.zeros((*scores.shape, scores.shape[-1])) if edges is None else expit(np.asarray(edges))
+    arrays = _arrays(answer, infos)
+    frames = [
+        _frame(info, {name: array[i] for name, array in arrays.items()}, options.threshold)
+        for i, info in enumerate(infos)
+    ]
 
     make_folder(options.out)
-    arrays = {"points": points, "scores": scores, "successor": successor}
+    _save_arrays(options.out / "predictions.npz", arrays)
+    truth = _truth(examples, lanes_of(answer), arrays)
+    if truth is not None:
+        _save_arrays(options.out / "truth.npz", truth | {name: arrays[name] for name in ("scene", "timestamp_ns")})
+    head = {"run": trained.name, "step": trained.step, "seed": trained.config.training.seeds[0]}
+    write_json(options.out / "predictions.json", head | {"threshold": options.threshold, "frames": frames})
+    label = f"{Path(trained.name).name}, step {trained.step}"
+    pictures = _draw(options, source, dataset, indices, examples, answer, label)
+
+    written = ", ".join(["predictions.npz", *(["truth.npz"] if truth else []), "predictions.json", *pictures])
+    lanes = sum(len(frame["lanes"]) for frame in frames)
+    found = f"{counted(len(indices), 'frame')}, {counted(lanes, 'lane')} with a score of at least {options.threshold:g}"
+    highest = arrays["scores"].max(initial=0.0)
+    best = "" if lanes else f" (best {highest:.2g}: choose a lower --threshold to see it)"
+    print(f"{found}{best}; written to {options.out}: {written}")
+    return 0
+
+
+def _arrays(answer: Prediction, infos: Sequence[FrameInfo]) -> dict[str, np.ndarray]:
+    """Return the arrays of predictions.npz."""
+    lanes, elements = lanes_of(answer), answer.elements
+    scores = expit(lanes.logits).max(-1)
+    arrays = {"points": np.asarray(lanes.points), "scores": scores}
     if isinstance(lanes, LinePrediction):
-        del arrays["successor"]
         arrays["category"] = np.asarray(lanes.logits).argmax(-1)
+    else:
+        edges = lanes.successor_logits
+        none = np.zeros((*scores.shape, scores.shape[-1]))
+        arrays["successor"] = none if edges is None else expit(np.asarray(edges))
     if isinstance(lanes, SegmentPrediction):
         arrays |= {"left": np.asarray(lanes.left), "right": np.asarray(lanes.right)}
         arrays["category"] = np.asarray(lanes.logits).argmax(-1)
@@ -91,48 +119,33 @@ def predict(trained: Run, options: argparse.Namespace) -> int:
         arrays["element_lane"] = expit(elements.lane_logits)
     arrays["scene"] = np.array([info.scene for info in infos])
     arrays["timestamp_ns"] = np.array([info.timestamp_ns for info in infos], np.int64)
-    _save_arrays(options.out / "predictions.npz", arrays)
-    truth = _truth(examples, lanes, arrays)
-    if truth is not None:
-        _save_arrays(options.out / "truth.npz", truth | {name: arrays[name] for name in ("scene", "timestamp_ns")})
-    frames = [
-        _frame(info, {name: array[i] for name, array in arrays.items()}, options.threshold)
-        for i, info in enumerate(infos)
-    ]
-    head = {"run": trained.name, "step": trained.step, "seed": trained.config.training.seeds[0]}
-    write_json(options.out / "predictions.json", head | {"threshold": options.threshold, "frames": frames})
-    written = ["predictions.npz", *(["truth.npz"] if truth else []), "predictions.json", "pictures.png"]
-    # From here on, the frames that are drawn.
+    return arrays
+
+
+def _draw(
+    options: argparse.Namespace,
+    source: LaneGraphSource,
+    dataset: Dataset,
+    indices: Sequence[int],
+    examples: Example,
+    answer: Prediction,
+    label: str,
+) -> list[str]:
+    """Draw some of the frames, and the camera views of those that have images; return the names of the files."""
     rows = spread(len(indices), MOST_DRAWN)
     drawn = [indices[row] for row in rows]
-    examples, lanes, elements = jax.tree.map(lambda leaf: np.asarray(leaf)[rows], (examples, lanes, elements))
-    names, ground, view = titles(dataset, drawn), source.example.ground, source.example.range
-    save_examples(
-        options.out / "pictures.png",
-        examples,
-        {f"{Path(trained.name).name}, step {trained.step}": lanes},
-        titles=names,
-        ground=ground,
-        view=view,
-        threshold=options.threshold,
+    examples, lanes, elements = jax.tree.map(
+        lambda leaf: np.asarray(leaf)[rows], (examples, lanes_of(answer), answer.elements)
     )
+    names = titles(dataset, drawn)
+    look = {"ground": source.example.ground, "view": source.example.range, "threshold": options.threshold}
+    save_examples(options.out / "pictures.png", examples, {label: lanes}, titles=names, **look)
     shown, examples = with_images(examples, source, drawn, rendered=options.cameras)
-    if shown:
-        save_camera_views(
-            options.out / "cameras.png",
-            examples,
-            *jax.tree.map(lambda leaf: np.asarray(leaf)[shown], (lanes, elements)),
-            titles=[names[i] for i in shown],
-            ground=ground,
-            view=view,
-            threshold=options.threshold,
-        )
-        written.append("cameras.png")
-    lanes_found = sum(len(frame["lanes"]) for frame in frames)
-    found = f"{counted(len(indices), 'frame')}, {counted(lanes_found, 'lane')} with a score of at least"
-    best = "" if lanes_found else f" (best {scores.max(initial=0.0):.2g}: choose a lower --threshold to see it)"
-    print(f"{found} {options.threshold:g}{best}; written to {options.out}: {', '.join(written)}")
-    return 0
+    if not shown:
+        return ["pictures.png"]
+    lanes, elements = jax.tree.map(lambda leaf: np.asarray(leaf)[shown], (lanes, elements))
+    save_camera_views(options.out / "cameras.png", examples, lanes, elements, titles=[names[i] for i in shown], **look)
+    return ["pictures.png", "cameras.png"]
 
 
 def _truth(examples: Example, lanes: Found, arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray] | None:

@@ -17,11 +17,11 @@ import jax.numpy as jnp
 
 from tflane_jax.errors import UserError
 from tflane_jax.scene import shapes_of
-from tflane_jax.summary import any_steps, training_program
+from tflane_jax.summary import Program, any_steps, training_program
 from tflane_jax.tasks.base import AnyTask
 from tflane_jax.training.loop import TrainingConfig
 from tflane_jax.training.schedule import OptimConfig, make_optimizer, scaled_to_batch
-from tflane_jax.training.state import init_state
+from tflane_jax.training.state import TrainState, init_state
 
 GIB = 2**30
 
@@ -96,40 +96,18 @@ def make_plan(
     Raises:
         UserError: the batch cannot be shared, or a number is out of range.
     """
-    if devices < 1:
-        raise UserError(f"--plan {devices}: at least 1 device")
-    if not 0.0 < utilisation <= 1.0:
-        raise UserError(f"--utilisation {utilisation:g}: above 0 and at most 1")
-    passes = devices * training.accumulate
-    if training.batch_size % passes:
-        raise UserError(
-            f"training.batch_size is {training.batch_size}, which {devices} devices and {training.accumulate} parts "
-            f"(training.accumulate) cannot share evenly: choose a multiple of {passes}"
-        )
+    part = _share_of_a_pass(training, devices, utilisation)
     device, optim = ACCELERATORS[kind], scaled_to_batch(optim, training.batch_size)
-    part = training.batch_size // passes
     program = training_program(task, example, part, optim, compiled=compiled)
     frames = example if task.frames == 1 else shapes_of(example, task.frames)
     state: Any = jax.eval_shape(
         partial(init_state, task, make_optimizer(optim, any_steps(optim))), jax.random.key(0), frames
     )
-    learned = _gib(state.learned)
-    temporary = None if program.temporary is None else program.temporary / 1024
-    # Parts add up in a further gradient.
-    activations = None if temporary is None else temporary + (learned if training.accumulate > 1 else 0.0)
-    shared = training.shard_state and devices > 1
-    holders = devices if shared else 1
-    parts = {
-        "parameters": learned / holders + _gib(state.statistics),
-        "their moving average": _gib(state.ema_learned) / holders + _gib(state.ema_statistics),
-        "optimizer": _gib(state.opt_state) / holders,
-        **({"parameters, gathered for the loss": learned} if shared else {}),
-        "batch": _gib(shapes_of(frames, part * training.accumulate)),
-        "gradients and activations": activations,
-    }
-    memory = None if activations is None else sum(value for value in parts.values() if value is not None)
+    batch = _gib(shapes_of(frames, part * training.accumulate))
+    parts = _memory(state, batch, program, training, devices)
+    memory = None if None in parts.values() else sum(value for value in parts.values() if value is not None)
 
-    half = _in_bfloat16(task)
+    shared, learned, half = _is_sharded(training, devices), _gib(state.learned), _in_bfloat16(task)
     peak = device.bfloat16 if half else device.float32
     operations = program.gflop * training.accumulate
     compute = operations / (1e3 * peak * utilisation)
@@ -161,6 +139,44 @@ def make_plan(
         learned,
         step,
     )
+
+
+def _share_of_a_pass(training: TrainingConfig, devices: int, utilisation: float) -> int:
+    """Return how many examples pass through the model of one device at once; refuse settings out of range."""
+    if devices < 1:
+        raise UserError(f"--plan {devices}: at least 1 device")
+    if not 0.0 < utilisation <= 1.0:
+        raise UserError(f"--utilisation {utilisation:g}: above 0 and at most 1")
+    passes = devices * training.accumulate
+    if training.batch_size % passes:
+        raise UserError(
+            f"training.batch_size is {training.batch_size}, which {devices} devices and {training.accumulate} parts "
+            f"(training.accumulate) cannot share evenly: choose a multiple of {passes}"
+        )
+    return training.batch_size // passes
+
+
+def _is_sharded(training: TrainingConfig, devices: int) -> bool:
+    return training.shard_state and devices > 1
+
+
+def _memory(
+    state: TrainState, batch: float, program: Program, training: TrainingConfig, devices: int
+) -> dict[str, float | None]:
+    """Return GiB of one device by what they hold; `batch` is that of its examples, None what was not compiled."""
+    learned, shared = _gib(state.learned), _is_sharded(training, devices)
+    temporary = None if program.temporary is None else program.temporary / 1024
+    # Parts add up in a further gradient.
+    activations = None if temporary is None else temporary + (learned if training.accumulate > 1 else 0.0)
+    holders = devices if shared else 1
+    return {
+        "parameters": learned / holders + _gib(state.statistics),
+        "their moving average": _gib(state.ema_learned) / holders + _gib(state.ema_statistics),
+        "optimizer": _gib(state.opt_state) / holders,
+        **({"parameters, gathered for the loss": learned} if shared else {}),
+        "batch": batch,
+        "gradients and activations": activations,
+    }
 
 
 def _gib(tree: Any) -> float:

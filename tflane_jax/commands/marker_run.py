@@ -80,32 +80,7 @@ def run(options: argparse.Namespace) -> int:
     if steps.remembers:
         check_rate([frame.timestamp_ns for frame in drive.frames], steps.interval)
     make_folder(options.out)
-    frames, outcomes = [], Counter()
-    with warnings.catch_warnings():
-        # The table counts them.
-        warnings.simplefilter("ignore", UnknownMarkerWarning)
-        warnings.simplefilter("ignore", StaleMarkerWarning)
-        for number, frame in enumerate(progress_bar(drive.frames, desc="drive", unit="frame")):
-            views = drive.views(frame, faults)
-            found = search_views(views, detector)
-            step = steps.step(views, frame.timestamp_ns, frame.global_from_ego, found)
-            outcomes.update(step.reading.observed.outcomes.values())
-            picture = f"{number:03d}.png"
-            record = {"timestamp_ns": frame.timestamp_ns, "picture": picture}
-            frames.append(record | _record(step, options.threshold))
-            save_drive_frame(
-                options.out / picture,
-                views,
-                step.reading.detected,
-                step.reading.observed.outcomes,
-                _confidence(step),
-                step.guidance,
-                None if step.prediction is None else lanes_of(step.prediction),
-                view=range_,
-                names=[camera.name for camera in drive.cameras],
-                title=f"frame {number}, {'remembered' if step.remembered else 'seen'}, c = {step.guidance.gate:.2f}",
-                threshold=options.threshold,
-            )
+    frames, outcomes = _follow(drive, steps, detector, range_, faults, options)
     head = {"store": str(options.store), "model": None if options.model is None else str(options.model)}
     told = [{"file": file, "error": error} for file, error in faults.items()]
     write_json(options.out / "frames.json", head | {"threshold": options.threshold, "frames": frames, "faults": told})
@@ -120,6 +95,46 @@ def run(options: argparse.Namespace) -> int:
     if faults:
         print(f"tflane: images of the drive left out: {len(faults)}, see above", file=sys.stderr)
     return 2 if faults else 0
+
+
+def _follow(
+    drive: Drive,
+    steps: MarkerDrive,
+    detector: DetectorConfig,
+    view: PerceptionRange,
+    faults: dict[str, str],
+    options: argparse.Namespace,
+) -> tuple[list[dict[str, Any]], Counter[str]]:
+    """Process all frames and draw each; return their records and how many boards had each outcome.
+
+    Images that cannot be read are added to `faults`.
+    """
+    frames, outcomes = [], Counter()
+    with warnings.catch_warnings():
+        # The table counts them.
+        warnings.simplefilter("ignore", UnknownMarkerWarning)
+        warnings.simplefilter("ignore", StaleMarkerWarning)
+        for number, frame in enumerate(progress_bar(drive.frames, desc="drive", unit="frame")):
+            views = drive.views(frame, faults)
+            step = steps.step(views, frame.timestamp_ns, frame.global_from_ego, search_views(views, detector))
+            outcomes.update(step.reading.observed.outcomes.values())
+            picture = f"{number:03d}.png"
+            record = {"timestamp_ns": frame.timestamp_ns, "picture": picture}
+            frames.append(record | _record(step, options.threshold))
+            save_drive_frame(
+                options.out / picture,
+                views,
+                step.reading.detected,
+                step.reading.observed.outcomes,
+                _confidence(step),
+                step.guidance,
+                None if step.prediction is None else lanes_of(step.prediction),
+                view=view,
+                names=[camera.name for camera in drive.cameras],
+                title=f"frame {number}, {'remembered' if step.remembered else 'seen'}, c = {step.guidance.gate:.2f}",
+                threshold=options.threshold,
+            )
+    return frames, outcomes
 
 
 def _model(folder: Path) -> DriveModel:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from tflane_jax.errors import UserError
 from tflane_jax.scene import LineType
@@ -155,10 +155,11 @@ def _build_side(
     speed: float,
     network: LaneNetwork,
 ) -> Side:
-    t, w = line.s, plan.lane_width
-    presence = [extra.presence(t) for extra in plan.extras]
+    """Lay out one direction; `cuts`, `ego` and `solid` are distances along it, as of `_cuts`."""
+    presence = [extra.presence(line.s) for extra in plan.extras]
     taken = {
-        place: w * sum((p for p, e in zip(presence, plan.extras, strict=True) if e.place is place), np.zeros(len(t)))
+        place: plan.lane_width
+        * sum((p for p, e in zip(presence, plan.extras, strict=True) if e.place is place), np.zeros(len(line.s)))
         for place in Place
     }
     shift = taken[Place.LEFT]
@@ -167,52 +168,13 @@ def _build_side(
     if not plan.lanes:
         return Side(plan, line, (), (), (), kerb, inner_edge)
 
-    dividers = line.offset(plan.inner + w * np.arange(plan.lanes + 1)[:, None] + shift)
-    columns = [_Column(a, b, None) for a, b in pairwise(dividers)]
-    for extra, fraction in zip(plan.extras, presence, strict=True):
-        # Where fraction = 1 the boundary is bit-identical to the neighbour's.
-        if extra.place is Place.RIGHT:
-            left, right = plan.outer + shift - w * (1.0 - fraction), plan.outer + shift + w * fraction
-        else:
-            left, right = plan.inner + shift - w * fraction, plan.inner + shift + w * (1.0 - fraction)
-        columns.append(_Column(line.offset(left), line.offset(right), extra))
-    at = np.searchsorted(t, cuts - SAME_STATION)
-
-    rows: list[dict[int, int]] = []  # section -> column -> segment id
-    for a, b in pairwise(at.tolist()):
-        middle = 0.5 * float(t[a] + t[b])
-        present = [i for i, c in enumerate(columns) if c.extra is None or c.extra.start < middle < c.extra.stop]
-        order = sorted(present, key=lambda i: _rank(i, columns[i].extra))
-        row = {}
-        for place, i in enumerate(order):
-            left_type = _marking(plan, columns, order, place - 1, middle, solid)
-            right_type = _marking(plan, columns, order, place, middle, solid)
-            row[i] = network.add(
-                Draft(
-                    columns[i].left[a : b + 1],
-                    columns[i].right[a : b + 1],
-                    left_type,
-                    right_type,
-                    speed,
-                    vehicle=True,
-                    is_intersection=False,
-                    ego=ego[0] <= middle <= ego[1],
-                )
-            )
-        rows.append(row)
-    _connect_sections(plan, rows, t[at], network)
-
+    columns = _columns(plan, line, presence, shift)
+    bounds = np.searchsorted(line.s, cuts - SAME_STATION)
+    rows = _add_sections(plan, columns, line.s, bounds, ego, solid, speed, network)
     bikes: list[int] = []
     if plan.bike:
         edge = plan.outer + shift + taken[Place.RIGHT]
-        left, right = line.offset(edge), line.offset(edge + plan.bike)
-        bikes.append(
-            network.add(
-                Draft(
-                    left, right, LineType.SOLID, LineType.SOLID, speed, vehicle=False, is_intersection=False, ego=False
-                )
-            )
-        )
+        bikes = [_add_bike_lane(line.offset(edge), line.offset(edge + plan.bike), speed, network)]
 
     def ends(row: dict[int, int]) -> list[tuple[int, int]]:
         order = sorted(row, key=lambda i: _rank(i, columns[i].extra))
@@ -228,6 +190,73 @@ def _build_side(
         kerb,
         inner_edge,
     )
+
+
+def _columns(
+    plan: SidePlan,
+    line: ReferenceLine,
+    presence: Sequence[Float[np.ndarray, " n"]],
+    shift: Float[np.ndarray, " n"],
+) -> list[_Column]:
+    """Return the lanes of a side, left to right, then its extra lanes.
+
+    Args:
+        presence: for each extra lane its width as a fraction of a lane's.
+        shift: metres by which lanes on the left push the others outwards.
+    """
+    w = plan.lane_width
+    dividers = line.offset(plan.inner + w * np.arange(plan.lanes + 1)[:, None] + shift)
+    columns = [_Column(a, b, None) for a, b in pairwise(dividers)]
+    for extra, fraction in zip(plan.extras, presence, strict=True):
+        # Where fraction = 1 the boundary is bit-identical to the neighbour's.
+        if extra.place is Place.RIGHT:
+            left, right = plan.outer + shift - w * (1.0 - fraction), plan.outer + shift + w * fraction
+        else:
+            left, right = plan.inner + shift - w * fraction, plan.inner + shift + w * (1.0 - fraction)
+        columns.append(_Column(line.offset(left), line.offset(right), extra))
+    return columns
+
+
+def _add_sections(
+    plan: SidePlan,
+    columns: Sequence[_Column],
+    stations: Float[np.ndarray, " n"],
+    bounds: Int[np.ndarray, " k"],
+    ego: tuple[float, float],
+    solid: float,
+    speed: float,
+    network: LaneNetwork,
+) -> list[dict[int, int]]:
+    """Add a side's segments, cut at the vertices `bounds`, and connect them; return for each section column -> id."""
+    rows = []
+    for a, b in pairwise(bounds.tolist()):
+        middle = 0.5 * float(stations[a] + stations[b])
+        present = [i for i, c in enumerate(columns) if c.extra is None or c.extra.start < middle < c.extra.stop]
+        order = sorted(present, key=lambda i: _rank(i, columns[i].extra))
+        row = {}
+        for place, i in enumerate(order):
+            row[i] = network.add(
+                Draft(
+                    columns[i].left[a : b + 1],
+                    columns[i].right[a : b + 1],
+                    _marking(plan, columns, order, place - 1, middle, solid),
+                    _marking(plan, columns, order, place, middle, solid),
+                    speed,
+                    vehicle=True,
+                    is_intersection=False,
+                    ego=ego[0] <= middle <= ego[1],
+                )
+            )
+        rows.append(row)
+    _connect_sections(plan, rows, stations[bounds], network)
+    return rows
+
+
+def _add_bike_lane(
+    left: Float[np.ndarray, "n 2"], right: Float[np.ndarray, "n 2"], speed: float, network: LaneNetwork
+) -> int:
+    solid = LineType.SOLID
+    return network.add(Draft(left, right, solid, solid, speed, vehicle=False, is_intersection=False, ego=False))
 
 
 def _rank(column: int, extra: ExtraLane | None) -> int:

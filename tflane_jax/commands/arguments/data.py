@@ -14,6 +14,11 @@ def data(commands) -> None:
         "data", help="show, check and convert datasets", description="Show, check and convert datasets."
     )
     inner = parser.add_subparsers(dest="what", required=True, metavar="COMMAND")
+    for add in (_show, _stats, _check, _export, _maps, _overlap, _build):
+        add(inner)
+
+
+def _show(inner) -> None:
     show = command(inner, "show", "draw samples of a dataset and count their content", module="data", function="show")
     show.add_argument(
         "--config", metavar="FILE[:NAME]", help="config file whose data to show (default: the built-in world)"
@@ -23,6 +28,9 @@ def data(commands) -> None:
     show.add_argument(
         "--out", metavar="FILE", type=Path, default=Path("samples.png"), help="picture (default samples.png)"
     )
+
+
+def _stats(inner) -> None:
     stats = command(
         inner,
         "stats",
@@ -43,6 +51,9 @@ def data(commands) -> None:
     )
     stats.add_argument("--out", metavar="STEM", type=stem, help="with --beside: write STEM.md, STEM.json and STEM.png")
     stats.set_defaults(takes_overrides=True)
+
+
+def _check(inner) -> None:
     check = command(
         inner, "check", "count the content of a dataset's folder and list its faults", module="data", function="check"
     )
@@ -64,6 +75,9 @@ def data(commands) -> None:
         action="store_true",
         help="read OpenLane-V2's images as a whole, not only header and end: finds damage within a file, takes hours",
     )
+
+
+def _export(inner) -> None:
     export = command(
         inner,
         "export",
@@ -93,6 +107,9 @@ def data(commands) -> None:
         "tables (six)",
     )
     export.set_defaults(takes_overrides=True)
+
+
+def _maps(inner) -> None:
     maps = command(
         inner,
         "maps",
@@ -107,6 +124,9 @@ def data(commands) -> None:
         "--moment", type=_moment, default=0.7, help="time in the recorded log, 0 to below 1 (default 0.7)"
     )
     maps.add_argument("--out", metavar="FILE", type=Path, default=Path("maps.png"), help="picture (default maps.png)")
+
+
+def _overlap(inner) -> None:
     overlap = command(
         inner,
         "overlap",
@@ -119,6 +139,9 @@ def data(commands) -> None:
     )
     overlap.add_argument("validation", metavar="VALIDATION", type=Path, help="the same for the validation split")
     overlap.add_argument("--out", metavar="STEM", type=stem, help="write STEM.md and STEM.json")
+
+
+def _build(inner) -> None:
     build = command(
         inner,
         "build",

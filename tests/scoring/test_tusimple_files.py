@@ -72,6 +72,15 @@ def test_slow_images_are_remarked(tmp_path, capsys):
     assert "longer than" not in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("more", [2, 3])
+def test_images_with_too_many_lanes_are_remarked(tmp_path, capsys, more):
+    lanes = TRUTH[0]["lanes"] + [TRUTH[0]["lanes"][0]] * more
+    found = [{"raw_file": TRUTH[0]["raw_file"], "lanes": lanes, "run_time": 1}]
+    row = run(tmp_path, found, TRUTH[:1])[1]
+    said = "1 of 1 images have over 2 lanes more than their labels and count as without lanes, by TuSimple's rule"
+    assert (row["FN"] == 1.0) == (said in capsys.readouterr().err) == (more == 3)
+
+
 def test_predictions_and_labels_that_are_swapped_are_guessed(tmp_path, capsys):
     assert run(tmp_path, TRUTH, GUESS)[0] == 2
     assert "It looks like ground truth: are PREDICTIONS and GROUND_TRUTH swapped?" in capsys.readouterr().err

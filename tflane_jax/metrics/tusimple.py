@@ -1,8 +1,9 @@
 """TuSimple lane metrics: accuracy, false positives and false negatives (docs/reference/metrics.md, section 5).
 
-Four official rules surprise, and are kept: rows without a point on both sides count as hits; a prediction may match
-several lanes, so that false positives can be negative; with more than four lanes, one may be missed without a penalty;
-with six or more lanes the accuracy can exceed 1.
+Five official rules surprise, and are kept: rows without a point on both sides count as hits; a prediction may match
+several lanes, so that false positives can be negative; an image with more than two lanes beyond the true ones counts as
+one without lanes; with more than four lanes, one may be missed without a penalty; with six or more lanes the accuracy
+can exceed 1.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from tflane_jax.metrics.merging import joined
 PIXEL_THRESHOLD = 20.0  # across the lane
 MATCHED = 0.85  # least fraction of rows
 OFFICIAL_TIME_LIMIT, LSTR_TIME_LIMIT = 200.0, 20_000.0  # milliseconds
+MORE_LANES = 2  # an image with more lanes beyond the true ones counts as missed
 _ABSENT = -100.0
 _LANES = 4  # the lines of the ego lane and of its neighbours
 
@@ -84,7 +86,7 @@ def score_image(
         own, right = (_range(r) for r in (detections.rows, rows))
         raise UserError(f"{what}: h_samples are {own}, those of the truth {right}: predict at the rows of the truth")
     g, p = len(true), len(found)
-    if detections.run_time > time_limit or p > g + 2:
+    if detections.run_time > time_limit or p > g + MORE_LANES:
         return 0.0, 0.0, 1.0
     best = line_accuracy(true, found, pixel_thresholds(true, rows)).max(1, initial=0.0)
     matched = int((best >= MATCHED).sum())

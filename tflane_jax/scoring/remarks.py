@@ -12,7 +12,7 @@ from tflane_jax.files.tusimple import RowLanes
 from tflane_jax.metrics.frames import LaneDetections, LaneTruth, Lines
 from tflane_jax.metrics.map_matching import MapDetections, MapTruth
 from tflane_jax.metrics.segment_matching import SegmentDetections, SegmentTruth
-from tflane_jax.metrics.tusimple import LSTR_TIME_LIMIT
+from tflane_jax.metrics.tusimple import LSTR_TIME_LIMIT, MORE_LANES
 from tflane_jax.scoring.openlane_v2 import AREA_POINTS, CENTERLINE_POINTS, LINE_POINTS
 
 Remarks = Callable[[Mapping[Any, Any], Mapping[Any, Any]], list[str]]
@@ -57,8 +57,8 @@ def segments(predictions: Mapping[Any, SegmentDetections], truth: Mapping[Any, S
 
 
 def images(predictions: Mapping[Any, RowLanes], truth: Mapping[Any, RowLanes], time_limit: float) -> list[str]:
-    """Return remarks on images that took longer than the limit (milliseconds), and on labels at other rows."""
-    return [*_slow(predictions, time_limit), *_other_rows(truth)]
+    """Return remarks on images that count as without lanes, and on labels at other rows; the limit is milliseconds."""
+    return [*_slow(predictions, time_limit), *_too_many(predictions, truth), *_other_rows(truth)]
 
 
 def nothing_near(
@@ -85,6 +85,16 @@ def _slow(predictions: Mapping[Any, RowLanes], time_limit: float) -> list[str]:
     return [
         f"{len(slow)} of {len(predictions)} images took longer than {time_limit:g} ms and count as without lanes, by "
         f"TuSimple's rule ({_named(slow)}){lenient}"
+    ]
+
+
+def _too_many(predictions: Mapping[Any, RowLanes], truth: Mapping[Any, RowLanes]) -> list[str]:
+    many = [key for key, one in predictions.items() if key in truth and len(one.x) > len(truth[key].x) + MORE_LANES]
+    if not many:
+        return []
+    return [
+        f"{len(many)} of {len(predictions)} images have over {MORE_LANES} lanes more than their labels and count as "
+        f"without lanes, by TuSimple's rule ({_named(many)}): leave out lanes of low confidence"
     ]
 
 

@@ -206,6 +206,18 @@ def test_bfloat16_stays_bfloat16_and_close():
         np.testing.assert_allclose(got.astype(np.float32), want, rtol=0.0, atol=0.02 * (1.0 + np.abs(want).max()))
 
 
+def test_gradients_of_many_blocks_in_bfloat16_are_as_good_as_those_of_one(monkeypatch):
+    exact = [x.astype(jnp.bfloat16).astype(jnp.float32) for x in arrays(7, 256, 32)]
+    want = with_gradients(*exact, None)[-2:]  # by keys and values, to which every block adds
+
+    def error(block):
+        monkeypatch.setattr(attention, "BLOCK", block)
+        got = with_gradients(*(x.astype(jnp.bfloat16) for x in exact), None)[-2:]
+        return max(np.abs(g.astype(np.float32) - w).max() / np.abs(w).max() for g, w in zip(got, want, strict=True))
+
+    assert error(2 * 32) < 2.0 * error(256 * 32)
+
+
 @settings(max_examples=15)
 @given(seed=st.integers(0, 2**16), size=st.sampled_from([(1, 1), (5, 6)]))
 def test_order_of_queries_and_keys_does_not_matter(seed, size):

@@ -123,7 +123,9 @@ def run(variables, query, features, reference, visible, capacity=None):
 
 def test_enough_capacity_changes_nothing_and_too_little_is_reported(variables):
     query, features, reference, visible = scene()
+    visible[:, -1] = True
     counts = visible.any(-1).sum(1)
+    assert len(set(counts.tolist())) > 1
     (dense, _), by_dense = run(variables, query, features, reference, visible)
     (compact, sown), by_compact = run(variables, query, features, reference, visible, int(counts.max()))
     np.testing.assert_allclose(compact, dense, atol=1e-6)
@@ -132,8 +134,12 @@ def test_enough_capacity_changes_nothing_and_too_little_is_reported(variables):
     # A query that no camera sees gets the bias of the projection alone.
     np.testing.assert_array_equal(dense[3], variables["params"]["output_proj"]["bias"])
     scarce = int(counts.max()) - 1
-    (_, sown), _ = run(variables, query, features, reference, visible, scarce)
+    (left_out, sown), _ = run(variables, query, features, reference, visible, scarce)
     assert sown["overflow"] == (np.maximum(counts - scarce, 0).sum(),)
+    # The last queries do without that camera, as if it did not see them.
+    visible &= (np.cumsum(visible.any(-1), 1) <= scarce)[..., None]
+    (expected, _), _ = run(variables, query, features, reference, visible)
+    np.testing.assert_allclose(left_out, expected, atol=1e-6)
 
 
 @pytest.mark.parametrize("capacity", [None, 5])

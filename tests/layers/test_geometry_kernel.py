@@ -108,8 +108,12 @@ def test_enough_capacity_changes_nothing_and_too_little_is_reported(params):
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-4), by_compact, by_dense)
     assert sown["overflow"] == (0,)
     scarce = int(counts.max()) - 1
-    _, sown, _ = run(params, query, features, reference, visible, capacity=scarce)
+    left_out, sown, _ = run(params, query, features, reference, visible, capacity=scarce)
     assert sown["overflow"] == (np.maximum(counts - scarce, 0).sum(),)
+    # The last queries do without that camera, as if it did not see them.
+    visible &= (jnp.cumsum(visible.any(-1), 1) <= scarce)[..., None]
+    expected, _, _ = run(params, query, features, reference, visible)
+    np.testing.assert_allclose(left_out, expected, atol=1e-5)
 
 
 @pytest.mark.parametrize("capacity", [None, 6])

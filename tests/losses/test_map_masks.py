@@ -62,11 +62,19 @@ def test_masks_agree_with_opencv(seed):
     assert maximum_filter(mask, 3)[thick > 0].all()
 
 
-def test_lines_are_cut_at_the_border_and_padding_draws_nothing():
+def test_lines_are_cut_at_the_border_or_run_along_it_and_padding_draws_nothing():
     outside = lines([(-90, 0.1), (0, 0.1), (90, 0.1)], [(40, 20), (50, 20), (60, 20)])
     inside = lines([(-29.9, 0.1), (0, 0.1), (29.9, 0.1)])
     np.testing.assert_array_equal(bev_line_mask(outside, SHAPE, RANGE), bev_line_mask(inside, SHAPE, RANGE))
     assert not bev_line_mask(lines(), SHAPE, RANGE).any()
+    for row, edge in ((slice(0, 2), -15), (slice(48, 50), 15)):
+        mask = np.asarray(bev_line_mask(lines([(-30, edge), (0, edge), (30, edge)]), SHAPE, RANGE))
+        assert mask[row].all()
+        assert mask.sum() == 200
+    for column, edge in ((slice(0, 2), -30), (slice(98, 100), 30)):
+        mask = np.asarray(bev_line_mask(lines([(edge, -15), (edge, 0), (edge, 15)]), SHAPE, RANGE))
+        assert mask[:, column].all()
+        assert mask.sum() == 100
     still = lines([(3, 3), (3, 3), (3, 3)])
     assert bev_line_mask(still, SHAPE, RANGE).sum() == 9
 

@@ -11,7 +11,7 @@ from typing import Any
 
 from jaxtyping import Bool, Float
 
-from tflane_jax.geometry.namespace import AnyArray, ArrayT, namespace
+from tflane_jax.geometry.namespace import AnyArray, ArrayT, namespace, product
 from tflane_jax.geometry.poses import invert_pose, transform_points
 
 MIN_DEPTH = 1e-5
@@ -33,7 +33,7 @@ def project(
     local = transform_points(camera_from_ego, points)
     depth = local[..., 2]
     valid = depth > min_depth
-    image = (local @ xp.swapaxes(intrinsics, -1, -2))[..., :2]
+    image = product(local, xp.swapaxes(intrinsics, -1, -2))[..., :2]
     pixels = image / xp.where(valid, depth, 1.0)[..., None]
     return xp.where(valid[..., None], pixels, 0.0), depth, valid
 
@@ -51,8 +51,8 @@ def ground_points(
     xp = namespace(pixels, intrinsics, camera_from_ego)
     ego_from_camera = invert_pose(camera_from_ego)
     homogeneous = xp.concatenate([pixels, xp.ones_like(pixels[..., :1])], -1)
-    rays = homogeneous @ xp.swapaxes(xp.linalg.inv(intrinsics), -1, -2)
-    rays = rays @ xp.swapaxes(ego_from_camera[..., :3, :3], -1, -2)
+    rays = product(homogeneous, xp.swapaxes(xp.linalg.inv(intrinsics), -1, -2))
+    rays = product(rays, xp.swapaxes(ego_from_camera[..., :3, :3], -1, -2))
     origin = ego_from_camera[..., None, :3, 3]
     slope, drop = rays[..., 2], height - origin[..., 2]
     valid = slope * drop > 0.0

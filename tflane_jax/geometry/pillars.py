@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from tflane_jax.geometry.cameras import MIN_DEPTH
-from tflane_jax.geometry.namespace import AnyArray, namespace
+from tflane_jax.geometry.namespace import AnyArray, namespace, product
 from tflane_jax.geometry.poses import transform_points
 from tflane_jax.geometry.ranges import BevGrid
 
@@ -51,7 +51,7 @@ def project_pillars(
     q, d = points.shape[:2]
     local = transform_points(camera_from_ego, xp.broadcast_to(points.reshape(1, q * d, 3), (len(size), q * d, 3)))
     depth = local[..., 2:]
-    image = (local @ xp.swapaxes(intrinsics, -1, -2))[..., :2]
+    image = product(local, xp.swapaxes(intrinsics, -1, -2))[..., :2]
     fraction = image / xp.maximum(depth, MIN_DEPTH) / size[:, None].astype(image.dtype)
     inside = (depth > MIN_DEPTH) & (fraction > 0.0) & (fraction < 1.0)
     return fraction.reshape(-1, q, d, 2), inside.all(-1).reshape(-1, q, d)

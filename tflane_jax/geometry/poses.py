@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from tflane_jax.geometry.namespace import AnyArray, ArrayT, namespace
+from tflane_jax.geometry.namespace import AnyArray, ArrayT, namespace, product
 
 
 def wrap_angle(angle: Float[np.ndarray, "*b"] | float) -> Float[np.ndarray, "*b"]:
@@ -32,7 +32,7 @@ def invert_pose(pose: Float[AnyArray, "*b n n"]) -> Float[Any, "*b n n"]:
     """Return the inverse motion, using that the rotation is orthonormal."""
     xp = namespace(pose)
     rotation = xp.swapaxes(pose[..., :-1, :-1], -1, -2)
-    translation = -(rotation @ pose[..., :-1, -1:])[..., 0]
+    translation = -product(rotation, pose[..., :-1, -1:])[..., 0]
     return pose_matrix(rotation, translation)
 
 
@@ -43,13 +43,13 @@ def relative_pose(
 
     Call it in float64: the two poses are far from the origin and their difference is small.
     """
-    return invert_pose(global_from_target) @ global_from_source
+    return product(invert_pose(global_from_target), global_from_source)
 
 
 def transform_points(pose: Float[AnyArray, "*b n n"], points: Float[AnyArray, "*b k d"]) -> Float[Any, "*b k d"]:
     """Apply `pose` (n = d + 1) to points; leading axes broadcast."""
     xp = namespace(pose, points)
-    rotated = points @ xp.swapaxes(pose[..., :-1, :-1], -1, -2)
+    rotated = product(points, xp.swapaxes(pose[..., :-1, :-1], -1, -2))
     shift = pose[..., None, :-1, -1]
     return rotated + shift.reshape((1,) * (rotated.ndim - shift.ndim) + shift.shape)
 

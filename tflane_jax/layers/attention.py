@@ -178,12 +178,14 @@ def _in_blocks_backward(rows, residuals, gradient):
         weights = jnp.exp(_logits(query, key, mask) - log_total)
         weights = lax.optimization_barrier(weights.astype(value.dtype))
         to_query, *to_others = _gradients(query, key, value, weights, out, gradient)
-        return jax.tree.map(jnp.add, sums, to_others), to_query
+        return [total + part.astype(total.dtype) for total, part in zip(sums, to_others, strict=True)], to_query
 
     masks = _split_mask(mask, query.shape[1], rows)
     inputs = (_split(query, rows), masks, out, log_total, _split(gradient, rows))
-    (to_key, to_value), to_query = lax.scan(block, [jnp.zeros_like(key), jnp.zeros_like(value)], inputs)
-    return _join(to_query), to_key, to_value, None
+    # Many blocks add up: their sums are float32 also for bfloat16.
+    start = [jnp.zeros(each.shape, _softmax_dtype(each)) for each in (key, value)]
+    (to_key, to_value), to_query = lax.scan(block, start, inputs)
+    return _join(to_query), to_key.astype(key.dtype), to_value.astype(value.dtype), None
 
 
 _attend_in_blocks.defvjp(_in_blocks_forward, _in_blocks_backward)

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from tflane_jax.geometry import BevGrid
+from tflane_jax.geometry.namespace import product
 from tflane_jax.geometry.pillars import cell_points
 from tflane_jax.geometry.poses import transform_points
 from tflane_jax.layers.sampling import sample_bilinear
@@ -73,7 +74,7 @@ def ego_shift(
         axes: of the grid. "ego": x forward, y left, as everywhere in this library and in TopoNet. "lidar": x right, y
             forward, the axes of nuScenes' lidar, for which BEVFormer derived its shift.
     """
-    moved = previous_from_ego[:2, :2].T @ previous_from_ego[:2, 3]
+    moved = product(previous_from_ego[:2, :2].T, previous_from_ego[:2, 3])
     if axes == "lidar":
         moved = jnp.stack([-moved[1], moved[0]])
     return moved / jnp.array(grid.range.size(2), moved.dtype)

@@ -116,7 +116,7 @@ class SpatialCrossAttention(nn.Module):
             around = jax.vmap(_around_anchors, in_axes=(0, None))(reference, offsets)
             # Unseen queries have weight 0, so that their gradients are zero.
             taken = jnp.where(seen[:, :, None, None, None], weights[None], 0.0)
-            total = deformable_attention(value, shapes, around, taken).sum(0)
+            total, served = deformable_attention(value, shapes, around, taken).sum(0), seen.sum(0)
         else:
             index = first_seen(seen, self.capacity)
             self.sow("intermediates", "overflow", jnp.maximum(seen.sum(1) - self.capacity, 0).sum())
@@ -127,8 +127,14 @@ class SpatialCrossAttention(nn.Module):
             found = deformable_attention(value, shapes, around, taken)
             total = jnp.zeros((queries, self.dim), found.dtype)
             total = total.at[index.reshape(-1)].add(found.reshape(-1, self.dim), mode="drop")
-        mean = total / jnp.maximum(seen.sum(0), 1)[:, None].astype(total.dtype)
+            served = times_listed(index, queries)
+        mean = total / jnp.maximum(served, 1)[:, None].astype(total.dtype)
         return nn.Dense(self.dim, kernel_init=_INIT, dtype=self.dtype, name="output_proj")(mean)
+
+
+def times_listed(index: Int[Array, "v capacity"], queries: int) -> Int[Array, " q"]:
+    """Return in how many rows of `first_seen` each of the Q queries stands."""
+    return jnp.zeros(queries, jnp.int32).at[index.reshape(-1)].add(1, mode="drop")
 
 
 def first_seen(seen: Bool[Array, "v q"], capacity: int) -> Int[Array, "v capacity"]:

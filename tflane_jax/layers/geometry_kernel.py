@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from tflane_jax.layers.bev_attention import first_seen
+from tflane_jax.layers.bev_attention import first_seen, times_listed
 
 _INIT = nn.initializers.xavier_uniform()
 
@@ -73,7 +73,7 @@ class GeometryKernelAttention(nn.Module):
             # Unseen queries have weight 0, so that their gradients are zero; their reference may be anything.
             taken = jnp.where(seen[:, :, None, None], weights[None], 0.0)
             around = jnp.where(seen[:, :, None, None], reference, 0.0)
-            total = kernel_sum(value, shapes[0], around, taken, self.kernel).sum(0)
+            total, served = kernel_sum(value, shapes[0], around, taken, self.kernel).sum(0), seen.sum(0)
         else:
             index = first_seen(seen, self.capacity)
             self.sow("intermediates", "overflow", jnp.maximum(seen.sum(1) - self.capacity, 0).sum())
@@ -82,7 +82,8 @@ class GeometryKernelAttention(nn.Module):
             found = kernel_sum(value, shapes[0], around, jnp.where(there, weights[pick], 0.0), self.kernel)
             total = jnp.zeros((queries, self.dim), found.dtype)
             total = total.at[index.reshape(-1)].add(found.reshape(-1, self.dim), mode="drop")
-        mean = total / jnp.maximum(seen.sum(0), 1)[:, None].astype(total.dtype)
+            served = times_listed(index, queries)
+        mean = total / jnp.maximum(served, 1)[:, None].astype(total.dtype)
         return nn.Dense(self.dim, kernel_init=_INIT, dtype=self.dtype, name="output_proj")(mean)
 
 

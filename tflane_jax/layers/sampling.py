@@ -106,10 +106,12 @@ def _hat(offset, several):
 
 
 def _slope(offset, several):
-    """Return the derivatives of `_hat`; at a kink, that to the right."""
-    first, second = (
-        jnp.where(jnp.abs(offset - place) < 1.0, jnp.where(offset < place, 1.0, -1.0), 0.0) for place in (0.0, 1.0)
-    )
+    """Return the derivatives of `_hat`; at a kink, that to the right, but 0 at -1, which marks a location outside.
+
+    Many first samples lie at a kink: locations at cell centres, with offsets of whole cells.
+    """
+    first = jnp.where(jnp.abs(offset) < 1.0, jnp.where(offset < 0.0, 1.0, -1.0), 0.0)
+    second = jnp.where((offset >= 0.0) & (offset < 2.0), jnp.where(offset < 1.0, 1.0, -1.0), 0.0)
     return first, jnp.where(several, second, 0.0)
 
 

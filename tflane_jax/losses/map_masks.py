@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import PerceptionRange, transform_points
+from tflane_jax.geometry.namespace import product
 from tflane_jax.scene import CameraViews, MapLines
 
 # Lines are cut at this depth, metres.
@@ -52,7 +53,7 @@ def view_line_masks(lines: MapLines, views: CameraViews, shape: tuple[int, int])
     cells: Any = jnp.diag(jnp.asarray((w / width, h / height, 1.0)))
 
     def one(intrinsics, camera_from_ego):
-        local = transform_points(camera_from_ego, points.reshape(-1, 3)) @ (cells @ intrinsics).T
+        local = product(transform_points(camera_from_ego, points.reshape(-1, 3)), product(cells, intrinsics).T)
         local = local.reshape(points.shape)
         start, end = local[:, :-1].reshape(-1, 3), local[:, 1:].reshape(-1, 3)
         ahead = _pieces(lines) & (jnp.maximum(start[:, 2], end[:, 2]) > _NEAR)
@@ -120,10 +121,13 @@ def _drawn(
     # Liang-Barsky: the part of each piece inside the grid.
     enter, leave = jnp.zeros(len(start)), jnp.ones(len(start))
     for axis, size in ((0, float(w)), (1, float(h))):
-        safe = jnp.where(step[:, axis] == 0.0, 1e-9, step[:, axis])
-        at_low, at_high = -start[:, axis] / safe, (size - start[:, axis]) / safe
-        enter = jnp.maximum(enter, jnp.minimum(at_low, at_high))
-        leave = jnp.minimum(leave, jnp.maximum(at_low, at_high))
+        low, high = -start[:, axis], size - start[:, axis]
+        parallel = step[:, axis] == 0.0
+        valid = valid & (~parallel | ((low <= 0.0) & (high >= 0.0)))
+        safe = jnp.where(parallel, 1.0, step[:, axis])
+        at_low, at_high = low / safe, high / safe
+        enter = jnp.maximum(enter, jnp.where(parallel, 0.0, jnp.minimum(at_low, at_high)))
+        leave = jnp.minimum(leave, jnp.where(parallel, 1.0, jnp.maximum(at_low, at_high)))
     valid = valid & (enter <= leave)
     first = start + enter[:, None] * step
     inside = (leave - enter)[:, None] * step

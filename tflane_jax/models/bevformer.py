@@ -9,13 +9,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import flax.linen as nn
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from tflane_jax.errors import UserError
+from tflane_jax.geometry.namespace import product
 from tflane_jax.geometry.pillars import pillar_points, project_pillars
 from tflane_jax.geometry.poses import pose_yaw
 from tflane_jax.layers.bev_alignment import ego_shift, rotate_nearest, vehicle_center, warp
@@ -142,9 +142,7 @@ def see_pillars(config: BevFormerConfig, cameras: CameraViews) -> tuple[Float[Ar
     height, width = cameras.image.shape[1:3]
     array, own = jnp.array([[width, height]]), jnp.asarray(cameras.size)
     size = jnp.broadcast_to({"own": own, "array": array, "first": own[:1]}[config.image_size], own.shape)
-    # Full float32: accelerators may multiply matrices at lower precision by default.
-    with jax.default_matmul_precision("highest"):
-        fraction, inside = project_pillars(jnp.asarray(points), cameras.intrinsics, cameras.camera_from_ego, size)
+    fraction, inside = project_pillars(jnp.asarray(points), cameras.intrinsics, cameras.camera_from_ego, size)
     if config.image_size != "first":
         used = size.astype(fraction.dtype) / array.astype(fraction.dtype)
         fraction = fraction * used[:, None, None]
@@ -185,7 +183,7 @@ def motion_vector(previous_from_ego: Float[Array, "4 4"], valid: Bool[Array, ""]
     Entries 0 to 2: translation in metres along the present axes; 16 and 17: yaw in radians and degrees. All others are
     0: BEVFormer's absolute heading and bus signals do not determine lanes.
     """
-    moved = previous_from_ego[:3, :3].T @ previous_from_ego[:3, 3]
+    moved = product(previous_from_ego[:3, :3].T, previous_from_ego[:3, 3])
     yaw = pose_yaw(previous_from_ego)
     turned = jnp.stack([yaw, jnp.rad2deg(yaw)])
     motion = jnp.concatenate([moved, jnp.zeros(MOTION - 5, moved.dtype), turned])

@@ -12,11 +12,11 @@ from dataclasses import replace
 from typing import Any
 
 import flax.linen as nn
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from tflane_jax.geometry import PerceptionRange, invert_pose, pose_yaw, transform_points, yaw_pose
+from tflane_jax.geometry.namespace import product
 from tflane_jax.models.prior import BevCells, HostQueries, Prior
 from tflane_jax.scene import CameraViews, Example, MapLines, SdMap, TrafficFlow, VehicleState
 
@@ -46,25 +46,22 @@ def lidar_from_ego(example: Example) -> Float[Array, "4 4"]:
 
 def level_pose(example: Example) -> Float[Array, "4 4"]:
     """Return ego_from_lidar without tilt."""
-    with jax.default_matmul_precision("highest"):
-        pose = invert_pose(lidar_from_ego(example))
+    pose = invert_pose(lidar_from_ego(example))
     level = yaw_pose(pose[0, 3], pose[1, 3], pose_yaw(pose))
     return level.at[2, 3].set(pose[2, 3])
 
 
 def in_lidar_axes(example: Example) -> Example:
     """Return cameras, traffic flow, SD map and motion of an example in the lidar's frame; the truth stays as it is."""
-    # Full float32: accelerators may multiply matrices at lower precision by default.
-    with jax.default_matmul_precision("highest"):
-        level = level_pose(example)
-        lidar = invert_pose(level)
-        return replace(
-            example,
-            cameras=None if example.cameras is None else _cameras(example.cameras, lidar_from_ego(example)),
-            traffic_flow=None if example.traffic_flow is None else _traffic(example.traffic_flow, lidar),
-            sd_map=None if example.sd_map is None else _sd_map(example.sd_map, lidar),
-            previous_from_ego=lidar @ jnp.asarray(example.previous_from_ego) @ level,
-        )
+    level = level_pose(example)
+    lidar = invert_pose(level)
+    return replace(
+        example,
+        cameras=None if example.cameras is None else _cameras(example.cameras, lidar_from_ego(example)),
+        traffic_flow=None if example.traffic_flow is None else _traffic(example.traffic_flow, lidar),
+        sd_map=None if example.sd_map is None else _sd_map(example.sd_map, lidar),
+        previous_from_ego=product(product(lidar, jnp.asarray(example.previous_from_ego)), level),
+    )
 
 
 def lines_beside_lidar(lines: MapLines, example: Example) -> MapLines:
@@ -75,8 +72,7 @@ def lines_beside_lidar(lines: MapLines, example: Example) -> MapLines:
         example: knows the lidar's pose.
     """
     turn = yaw_pose(*jnp.array([0.0, 0.0, -math.pi / 2]))
-    with jax.default_matmul_precision("highest"):
-        pose = turn @ invert_pose(level_pose(example))
+    pose = product(turn, invert_pose(level_pose(example)))
     return replace(lines, points=lines_in_ego_axes(jnp.asarray(lines.points), pose))
 
 
@@ -84,15 +80,15 @@ def lines_in_ego_axes(points: Float[Array, "*b p d"], level: Float[Array, "4 4"]
     """Return points (x, y or x, y, z) of the lidar's frame in that of the example, see `level_pose`."""
     size = points.shape[-1]
     pose = level if size == 3 else level[jnp.array([0, 1, 3])][:, jnp.array([0, 1, 3])]
-    with jax.default_matmul_precision("highest"):
-        return transform_points(pose, points.reshape(-1, size)).reshape(points.shape)
+    return transform_points(pose, points.reshape(-1, size)).reshape(points.shape)
 
 
 def _cameras(cameras: CameraViews, lidar: Float[Array, "4 4"]) -> CameraViews:
     ego, vehicle = invert_pose(lidar), cameras.vehicle
     own = jnp.eye(4, dtype=lidar.dtype) if vehicle is None else jnp.asarray(vehicle.vehicle_from_ego)
-    state = VehicleState(jnp.eye(4, dtype=lidar.dtype), own @ ego, None if vehicle is None else vehicle.can_bus)
-    return replace(cameras, camera_from_ego=jnp.asarray(cameras.camera_from_ego) @ ego, vehicle=state)
+    can_bus = None if vehicle is None else vehicle.can_bus
+    state = VehicleState(jnp.eye(4, dtype=lidar.dtype), product(own, ego), can_bus)
+    return replace(cameras, camera_from_ego=product(jnp.asarray(cameras.camera_from_ego), ego), vehicle=state)
 
 
 def _traffic(flow: TrafficFlow, lidar: Float[Array, "4 4"]) -> TrafficFlow:

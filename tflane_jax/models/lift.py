@@ -20,6 +20,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import BevGrid, PerceptionRange, invert_pose
+from tflane_jax.geometry.namespace import product
 from tflane_jax.geometry.pillars import cell_points
 from tflane_jax.layers.batch_norm import BatchNorm
 from tflane_jax.layers.depth_net import DepthNet
@@ -164,15 +165,12 @@ class LiftEncoder(nn.Module):
         eye = jnp.eye(4, dtype=jnp.float32)[None]
         pose = jnp.where(valid, cameras.camera_from_ego, eye)
         intrinsics = jnp.where(valid, cameras.intrinsics, eye[:, :3, :3])
-        # Full float32: accelerators may multiply matrices at lower precision by default.
-        with jax.default_matmul_precision("highest"):
-            points = ray_points(intrinsics, pose, size, shape, self.config.depth)
+        points = ray_points(intrinsics, pose, size, shape, self.config.depth)
         points = jnp.where(valid[..., None, None], points, jnp.nan)
         features = jnp.where(valid[..., None], features, 0.0)
         if cameras.vehicle is not None:
             # The depth network gets the cameras' poses in the vehicle's own frame.
-            with jax.default_matmul_precision("highest"):
-                own = pose @ invert_pose(jnp.asarray(cameras.vehicle.vehicle_from_ego))[None]
+            own = product(pose, invert_pose(jnp.asarray(cameras.vehicle.vehicle_from_ego))[None])
             pose = jnp.where(valid, own, eye)
         scale = self.config.image_scale
         affine = jnp.broadcast_to(jnp.array([[[scale, 0.0, 0.0], [0.0, scale, 0.0]]]), (len(intrinsics), 2, 3))
@@ -221,8 +219,8 @@ def ray_points(
     pixels = jnp.stack([u * d, v * d, d], -1).reshape(-1, 3)
 
     def one(intrinsics, camera_from_ego):
-        local = pixels @ jnp.linalg.inv(intrinsics).T
-        return (local - camera_from_ego[None, :3, 3]) @ camera_from_ego[:3, :3]
+        local = product(pixels, jnp.linalg.inv(intrinsics).T)
+        return product(local - camera_from_ego[None, :3, 3], camera_from_ego[:3, :3])
 
     return jax.vmap(one)(intrinsics, camera_from_ego).reshape(len(intrinsics), *d.shape, 3)
 

@@ -205,7 +205,9 @@ def _to_present(points: Float[Array, "t l k 2"], previous_from_ego: Float[Array,
     """Return points of the previous ego frame in the present one, by the inverse pose in the plane."""
     rotation, shift = previous_from_ego[:2, :2], previous_from_ego[:2, 3]
     # With pitch and roll the upper left block is not orthogonal, so the transpose is not its inverse.
-    return jnp.einsum("ij,tlkj->tlki", jnp.linalg.inv(rotation), points - shift[None, None, None])
+    # Full precision, as of `geometry.namespace.product`: the same lanes are moved in every frame.
+    inverse, moved = jnp.linalg.inv(rotation), points - shift[None, None, None]
+    return jnp.einsum("ij,tlkj->tlki", inverse, moved, precision="highest")
 
 
 def _power(base: Array, exponent: float) -> Array:

@@ -58,9 +58,11 @@ def _run_command(options: argparse.Namespace, rest: Sequence[str]) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 128 + signal.SIGPIPE
     except OSError as error:
-        if error.errno != errno.ENAMETOOLONG:  # pathlib raises it wherever it looks for such a file
+        # pathlib raises these wherever it looks for such a file
+        if error.errno not in (errno.ENAMETOOLONG, errno.EACCES, errno.EPERM):
             raise
-        print(f"tflane: {error.filename}: {error.strerror}", file=sys.stderr)
+        remedy = "" if error.errno == errno.ENAMETOOLONG else ": give yourself the right, or choose another path"
+        print(f"tflane: {error.filename}: {error.strerror}{remedy}", file=sys.stderr)
         return 2
 
 

@@ -85,6 +85,16 @@ def test_numbers_that_are_none_and_missing_checkpoints_are_kept(tmp_path):
     assert read.facts == run.facts
 
 
+def test_long_flags_are_read_as_they_were_written_and_nothing_unreadable_is_written(tmp_path):
+    path, flags = tmp_path / "a.json.gz", " ".join(f"--xla_gpu_setting_{i}=true" for i in range(40))
+    run = replace(RUN, threads={"cores": 1, "XLA_FLAGS": flags})
+    assert read_archive(write_archive(path, replace(ARCHIVE, runs={RUN.key: run}))).runs[RUN.key].threads == run.threads
+    before = path.read_bytes()
+    with pytest.raises(UserError, match="is no short text"):
+        write_archive(path, replace(ARCHIVE, runs={RUN.key: replace(RUN, row="x" * 301)}))
+    assert path.read_bytes() == before
+
+
 def test_the_run_that_was_recorded_last_stays():
     def archive(**changes):
         run = replace(RUN, **changes)

@@ -9,10 +9,11 @@ import pytest
 from tests.ablations.test_identity import QUICK
 from tests.test_cli import fakes  # noqa: F401 (a fixture that is used by itself)
 from tflane_jax.ablations import scores, workers
-from tflane_jax.ablations.jobs import check_rows, plan_jobs
+from tflane_jax.ablations.jobs import Job, check_rows, plan_jobs
 from tflane_jax.ablations.recorded import Measured
 from tflane_jax.ablations.report import save_report
 from tflane_jax.ablations.results import Results
+from tflane_jax.ablations.workers import noted
 from tflane_jax.cli import main
 from tflane_jax.config import RunConfig
 from tflane_jax.errors import UserError
@@ -75,6 +76,15 @@ def test_a_failed_training_stops_no_other_and_is_listed(tiny, tmp_path, monkeypa
     # The same command trains what is missing.
     assert compare(tiny, out, "0123", "--test", "few=--data.test 3") == 0
     assert "two-sided t-test over 4 seeds" in (out / "paired.md").read_text()
+
+
+def test_a_failure_is_listed_where_its_log_cannot_be_written(tmp_path, capsys):
+    (tmp_path / "file").touch()
+    job, failures = Job(RunConfig(), tmp_path / "file" / "run"), []
+    with noted(job, failures):
+        raise UserError("no space left")
+    assert [failure.reason for failure in failures] == ["no space left"]
+    assert "tflane: no space left" in capsys.readouterr().err
 
 
 def test_a_run_that_cannot_be_evaluated_stops_no_table(tiny, tmp_path, monkeypatch, capsys):

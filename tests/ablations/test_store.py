@@ -15,6 +15,7 @@ from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import write_json
 from tflane_jax.training import provenance
 from tflane_jax.training.loop import TrainingConfig
+from tflane_jax.training.run_folder import check_unchanged
 
 THREADS = {"cores": 1}
 CONFIG = RunConfig()
@@ -56,6 +57,23 @@ def test_a_row_starts_from_the_run_of_its_own_seed_wherever_the_store_is():
         assert starts == [str(job.folder) for job in hosts["host"]]
     here, there = ([job.folder.name for job in plan["row"]] for plan in plans)
     assert here == there
+
+
+def test_a_store_that_was_moved_holds_the_same_runs(tmp_path):
+    def planned(store):
+        hosts = stored_jobs({"host": CONFIG, "other": changed(steps=7)}, [0], store, threads=THREADS)
+        row = changed(steps=5, init_from="somewhere")
+        return stored_jobs({"row": row}, [0], store, threads=THREADS, origins={"row": hosts["host"]})["row"][0], hosts
+
+    (there, _), (here, hosts) = planned(Path("elsewhere/runs")), planned(tmp_path)
+    begun(replace(there, folder=here.folder), THREADS)
+    assert here.difference() == ""
+    assert check_unchanged(here.folder, to_json(here.config)) == []
+    other = replace(here.config.training, init_from=str(hosts["other"][0].folder))
+    moved = replace(here, config=replace(here.config, training=other))
+    assert "training.init_from" in moved.difference()
+    with pytest.raises(UserError, match=r"training\.init_from"):
+        check_unchanged(here.folder, to_json(moved.config))
 
 
 @pytest.mark.parametrize(("recorded", "expected"), [({}, (240.0, 2)), ({0: (10, 30.0)}, (60.0 + 90.0, 0))])

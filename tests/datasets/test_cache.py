@@ -196,6 +196,32 @@ def test_a_full_disk_is_one_message(tmp_path, monkeypatch):
     assert entries(tmp_path) == []
 
 
+def test_a_file_system_without_locks_is_told_and_used(tmp_path, monkeypatch, capsys):
+    def no_locks(*_):
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr("fcntl.flock", no_locks)
+    build(tmp_path)
+    assert "this file system has no locks" in capsys.readouterr().err
+
+
+def test_a_lock_that_was_deleted_with_its_entry_is_taken_anew(tmp_path, monkeypatch):
+    import fcntl
+
+    taken, entry, real = [], tmp_path / "entry", fcntl.flock
+
+    def deleted_meanwhile(lock, how):
+        taken.append(lock)
+        if len(taken) == 1:
+            (tmp_path / "entry.lock").unlink()
+        real(lock, how)
+
+    monkeypatch.setattr("fcntl.flock", deleted_meanwhile)
+    with cache._only_builder(entry):
+        assert len(taken) == 2
+        assert (tmp_path / "entry.lock").is_file()
+
+
 def test_too_large_a_dataset_is_refused_before_the_work(tmp_path, monkeypatch):
     monkeypatch.setattr(cache.shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(10, 9, 1))
     monkeypatch.setattr(cache, "fill", lambda *_, **__: pytest.fail("started"))

@@ -147,6 +147,7 @@ def test_the_command_writes_checks_and_counts(tmp_path, monkeypatch, capsys):
         ("--out full --data.example.cameras default", "full is not empty"),
         ("--out new --tracks full --data.example.cameras default", "full is not empty"),
         ("--out new --tracks ./new --data.example.cameras default", "--out and --tracks are both new"),
+        ("--out new/here --tracks new --data.example.cameras default", "--out new/here is inside of --tracks new"),
         ("--out new --config gtn_lane/gtn", "front-views-train are single images"),
         ("--out new", "procedural-train has no camera images, which OpenLane-V2 needs: set data.example.cameras\n"),
         (

@@ -2,6 +2,7 @@
 
 import errno
 import glob
+import importlib.util
 import json
 import math
 import os
@@ -13,6 +14,7 @@ import threading
 import pytest
 
 from tflane_jax.errors import UserError
+from tflane_jax.files import atomic
 from tflane_jax.files.atomic import check_stem, is_temporary, replacing, write_bytes, write_json, write_text
 
 
@@ -166,6 +168,18 @@ def test_temporary_names_are_unique_and_hidden_from_globs(tmp_path):
         assert glob.glob(str(tmp_path / "*")) == []
     assert names(tmp_path) == ["a.json"]
     assert not any(map(is_temporary, ("a.json", ".a.json", ".tmp", "a.12-3.tmp", ".gitignore")))
+
+
+def test_processes_of_two_machines_with_one_number_have_names_of_their_own(tmp_path):
+    def name_in_a_new_process():
+        spec = importlib.util.spec_from_file_location("fresh", atomic.__file__)
+        fresh = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(fresh)
+        with fresh.replacing(tmp_path / "a.json") as temporary:
+            temporary.touch()
+        return temporary.name
+
+    assert name_in_a_new_process() != name_in_a_new_process()
 
 
 @pytest.mark.parametrize("before", ["old", None])

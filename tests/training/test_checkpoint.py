@@ -1,6 +1,7 @@
 """Checkpoints: bit-identical round trips, and a clear message for every fault of a folder."""
 
 import json
+import shutil
 import sys
 import time
 
@@ -99,6 +100,32 @@ def test_leftovers_of_a_killed_write_are_no_checkpoint(tmp_path, state):
     saved(tmp_path, state, [(1, None)])
     assert not leftover.exists()
     assert checkpoints.steps() == [1]
+
+
+@pytest.mark.parametrize("scores", [[(1, 0.5), (2, 0.4), (3, 0.6)], [(1, None), (1, 0.7)]], ids=["old", "replaced"])
+def test_a_process_killed_while_it_deletes_a_checkpoint_leaves_no_part_of_it(tmp_path, state, monkeypatch, scores):
+    def killed(path, *_, **__):
+        (path / "manifest.json").unlink()
+        raise KeyboardInterrupt
+
+    saved(tmp_path, state, scores[:-1], keep=1)
+    with monkeypatch.context() as patch:
+        patch.setattr("tflane_jax.training.checkpoint.shutil.rmtree", killed)
+        with pytest.raises(KeyboardInterrupt):
+            saved(tmp_path, state, scores[-1:], keep=1)
+    checkpoints = Checkpoints(tmp_path, keep=1, best_metric="score")
+    assert all(checkpoints.manifest(step) for step in checkpoints.steps())
+    checkpoints = saved(tmp_path, state, [(9, 1.0)], keep=1)
+    assert (checkpoints.steps(), checkpoints.best_step()) == ([9], 9)
+    assert [path.name for path in tmp_path.iterdir()] == ["step_00000009"]
+
+
+def test_a_checkpoint_that_is_dropped_while_it_is_read_is_not_the_best(tmp_path, state, monkeypatch):
+    checkpoints = saved(tmp_path, state, [(1, 0.9), (2, 0.5)])
+    steps = checkpoints.steps()
+    shutil.rmtree(checkpoints.path(1))
+    monkeypatch.setattr(checkpoints, "steps", lambda: steps)
+    assert checkpoints.best_step() == 2
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import errno
 import json
 import shutil
 
@@ -15,6 +16,7 @@ from tflane_jax.errors import UserError
 from tflane_jax.training import loop
 from tflane_jax.training.checkpoint import Checkpoints
 from tflane_jax.training.provenance import read_provenance, thread_setting
+from tflane_jax.training.run_folder import claimed
 
 
 def exploding_after(step: int) -> dict:
@@ -62,6 +64,16 @@ def test_a_run_that_lacks_a_new_setting_resumes_with_its_default(tmp_path, capsy
     older(folder, training="best_metric")
     with pytest.raises(UserError, match=r"another configuration \(training\.best_metric: score there, other here\)"):
         run(folder, start="resume", current_form=completed, resolved=other)
+
+
+def test_a_file_system_without_locks_is_told_and_trained_on(tmp_path, capsys, monkeypatch):
+    def no_locks(*_):
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr("fcntl.flock", no_locks)
+    with claimed(tmp_path / "run", "new"):
+        assert (tmp_path / "run").is_dir()
+    assert "this file system has no locks (No locks available)" in capsys.readouterr().err
 
 
 def test_the_number_of_cores_is_recorded_and_a_change_is_reported(tmp_path, capsys, monkeypatch):

@@ -35,7 +35,7 @@ FORMAT = 1
 LARGEST_FILE, LARGEST_TEXT = 2**23, 2**26
 """Bytes of the file, and of the JSON in it."""
 _LARGEST_NUMBER = 2**53
-_LONGEST_TEXT = 300
+_LONGEST_TEXT, _LONGEST_SETTING = 300, 10_000
 _STEPS = 10**DIGITS
 """Files hold scores of samples as integers: the score times this."""
 
@@ -106,7 +106,10 @@ class _Shared:
 
 
 def write_archive(path: Path, archive: Archive) -> Path:
-    """Write a record whole or not at all, and return its path; equal records give the same bytes."""
+    """Write a record whole or not at all, and return its path; equal records give the same bytes.
+
+    Raises UserError for a record that `read_archive` would refuse.
+    """
     scores, scenes, entries, configs = _Shared(), _Shared(), _Shared(), _Shared()
 
     def entry(measured: Measured | None) -> int | None:
@@ -152,8 +155,12 @@ def write_archive(path: Path, archive: Archive) -> Path:
         "configs": configs.values,
         "runs": runs,
     }
-    text = json.dumps(content, separators=(",", ":"))
-    return write_bytes(path, gzip.compress(text.encode(), 9, mtime=0))
+    text = json.dumps(content, separators=(",", ":")).encode()
+    packed = gzip.compress(text, 9, mtime=0)
+    if len(packed) > LARGEST_FILE or len(text) > LARGEST_TEXT:
+        raise UserError(f"cannot write {path}: it would be too large for a record of scores, {len(text):,} bytes")
+    _archive(json.loads(text), path)
+    return write_bytes(path, packed)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -256,7 +263,11 @@ def _run(key: str, run: Any, configs: Sequence[Any], entries: Sequence[Measured]
 
     threads = _mapping(member(run, "threads", where), f"{where}: threads")
     for name, value in threads.items():
-        (_count if name == "cores" else _text)(value, f"{where}: threads, {_text(name, where)}")
+        place = f"{where}: threads, {_text(name, where)}"
+        if name == "cores":
+            _count(value, place)
+        else:
+            _text(value, place, longest=_LONGEST_SETTING)
     member(threads, "cores", f"{where}: threads")
     seconds, measured = member(run, "seconds", where), member(run, "measured", where)
     records = enumerate(items(run, "validation", where))
@@ -310,8 +321,8 @@ def _chosen(values: Sequence[T], place: Any, where: str) -> T:
     return values[place]
 
 
-def _text(value: Any, where: str) -> str:
-    if not isinstance(value, str) or len(value) > _LONGEST_TEXT or not value.isprintable():
+def _text(value: Any, where: str, longest: int = _LONGEST_TEXT) -> str:
+    if not isinstance(value, str) or len(value) > longest or not value.isprintable():
         raise UserError(f"{where}: {shown(value)} is no short text")
     return value
 

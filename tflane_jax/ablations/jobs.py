@@ -25,7 +25,7 @@ from tflane_jax.runs import check_origin, current_form
 from tflane_jax.training.checkpoint import Checkpoints
 from tflane_jax.training.fine_tuning import origin_folders, origins
 from tflane_jax.training.provenance import read_provenance, thread_setting, threads_of
-from tflane_jax.training.run_folder import Start, read_config
+from tflane_jax.training.run_folder import Start, read_config, with_same_origin
 
 Tests = Mapping[str, Sequence[str]]
 """Test sets by name: settings of the data, `--data.name value`, that differ from the configuration's test split."""
@@ -92,7 +92,8 @@ class Job:
             saved, _ = current_form(read_config(self.folder))
         except UserError as error:
             return str(error)
-        if difference := first_difference(saved, to_json(self.config)):
+        wanted = to_json(self.config)
+        if difference := first_difference(with_same_origin(saved, wanted, self.folder), wanted):
             return difference
         # A run that was started before these were recorded is taken as it is.
         for start in read_provenance(self.folder):

@@ -64,8 +64,8 @@ def noted(job: Job, failures: list[Failure]) -> Iterator[None]:
         yield
     except Exception as error:
         known = isinstance(error, UserError)
-        _log(job, f"tflane: {error}" if known else traceback.format_exc())
         failures.append(Failure(job, str(error) if known else f"{type(error).__name__}: {error}"))
+        _log(job, f"tflane: {error}" if known else traceback.format_exc())
 
 
 def _tell(failures: Sequence[Failure]) -> None:
@@ -74,9 +74,12 @@ def _tell(failures: Sequence[Failure]) -> None:
 
 
 def _log(job: Job, text: str) -> None:
-    job.log.parent.mkdir(parents=True, exist_ok=True)
-    with job.log.open("a", encoding="utf-8") as log:
-        print(text, file=log)
+    try:
+        job.log.parent.mkdir(parents=True, exist_ok=True)
+        with job.log.open("a", encoding="utf-8") as log:
+            print(text, file=log)
+    except OSError as error:  # a full disk, which may be why the training failed
+        write(f"cannot write {job.log} ({error.strerror}):\n{text}")
 
 
 def _train_here(queue: Queue) -> list[Failure]:

@@ -56,8 +56,12 @@ def _check_folders(out: Path, tracks: Path | None) -> None:
     for folder in (out,) if tracks is None else (out, tracks):
         if folder.is_dir() and any(folder.iterdir()):
             raise UserError(f"{folder} is not empty: choose another folder")
-    if tracks is not None and tracks.resolve() == out.resolve():
+    if tracks is None:
+        return
+    if tracks.resolve() == out.resolve():
         raise UserError(f"--out and --tracks are both {out}: the tracks need a folder of their own")
+    if tracks.resolve() in out.resolve().parents:
+        raise UserError(f"--out {out} is inside of --tracks {tracks}: the tracks need a folder of their own")
 
 
 def _check_cameras(chosen: Mapping[Split, Any]) -> None:

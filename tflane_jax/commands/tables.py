@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from tflane_jax.ablations.published import record
 from tflane_jax.ablations.tables import TABLES, find_table
 from tflane_jax.errors import UserError
 from tflane_jax.plots.tables import format_table
+from tflane_jax.training.run_folder import is_locked
 from tflane_jax.training.runtime import configure_jax
 
 
@@ -73,9 +75,23 @@ def _convert(conversions: Sequence[Conversion]) -> None:
     from tflane_jax.commands.convert import convert
 
     for wanted in conversions:
-        if not (Path(wanted.out) / "config.json").exists():
-            convert(wanted.config, Path(wanted.out), Path(wanted.weights), wanted.edge_weight)
+        out = Path(wanted.out)
+        if (out / "config.json").exists():
+            continue
+        try:
+            convert(wanted.config, out, Path(wanted.weights), wanted.edge_weight)
+        except UserError:
+            if not _made_by_another(out):
+                raise
+        else:
             print(f"converted {wanted.weights} to {wanted.out}, from which rows start", flush=True)
+
+
+def _made_by_another(out: Path) -> bool:
+    """Return whether another process that runs the same table has made a run, after waiting for it."""
+    while is_locked(out):
+        time.sleep(1.0)
+    return (out / "config.json").exists()
 
 
 def _check_together(options: argparse.Namespace) -> None:

@@ -310,13 +310,33 @@ def _only_builder(folder: Path) -> Iterator[None]:
         # Windows has no such locks; there, nothing prevents two processes from building one entry at once.
         yield
         return
-    with open(folder.with_name(folder.name + ".lock"), "w") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            print(f"waiting for another process that builds {folder.name}", file=sys.stderr)
-            fcntl.flock(lock, fcntl.LOCK_EX)
+    path = folder.with_name(folder.name + ".lock")
+    with contextlib.ExitStack() as stack:
+        while True:
+            lock = stack.enter_context(open(path, "w"))
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                print(f"waiting for another process that builds {folder.name}", file=sys.stderr)
+                fcntl.flock(lock, fcntl.LOCK_EX)
+            except OSError as error:
+                print(
+                    f"{folder.parent}: this file system has no locks ({error.strerror}): processes that need the same "
+                    "examples at once may each make them",
+                    file=sys.stderr,
+                )
+            # Whoever deletes an entry deletes its lock too, perhaps while this process waited for it.
+            if _is_at(lock.fileno(), path):
+                break
         yield
+
+
+def _is_at(handle: int, path: Path) -> bool:
+    """Return whether an open file is still the one that a path names."""
+    try:
+        return os.path.samestat(os.fstat(handle), os.stat(path))
+    except FileNotFoundError:
+        return False
 
 
 def _explain(error: OSError, root: Path) -> Exception:

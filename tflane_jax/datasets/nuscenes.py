@@ -41,7 +41,7 @@ from tflane_jax.datasets.nuscenes_log import (
 from tflane_jax.datasets.nuscenes_map import MapExpansion, read_expansion
 from tflane_jax.datasets.nuscenes_scenes import NUSCENES_SIZES
 from tflane_jax.datasets.nuscenes_splits import split_scenes
-from tflane_jax.datasets.nuscenes_tables import find_tables, read_tables
+from tflane_jax.datasets.nuscenes_tables import find_tables, shared_tables
 from tflane_jax.datasets.openlane_example import camera_views
 from tflane_jax.datasets.openlane_frames import FrameCamera
 from tflane_jax.datasets.overlap import frame_drives
@@ -109,7 +109,7 @@ class NuScenesDataset:
         self.name = f"nuscenes-{config.split}"
         if config.example.cameras is not None:
             raise UserError("nuScenes has real cameras: set example.cameras=None and give `image`")
-        self.tables = read_tables(find_tables(config.root, config.version))
+        self.tables = shared_tables(find_tables(config.root, config.version))
         scenes = self.tables.scenes()
         names = split_scenes(scenes, config.split, mini=self.tables.mini, file=config.splits)
         self.scenes = {name: scenes[name] for name in names}

@@ -10,7 +10,7 @@ from typing import Any
 from tflane_jax.datasets.log_frames import LogOutline
 from tflane_jax.datasets.nuscenes_log import key_frames, scene_frames, scene_log
 from tflane_jax.datasets.nuscenes_map import MapExpansion, read_expansion
-from tflane_jax.datasets.nuscenes_tables import TABLES, Tables, read_tables
+from tflane_jax.datasets.nuscenes_tables import TABLES, shared_tables
 from tflane_jax.errors import UserError
 from tflane_jax.files.fields import member, shown
 from tflane_jax.files.json_rows import json_rows
@@ -56,7 +56,7 @@ def read_scene(folder: Path, name: str) -> Log:
         folder: of the tables, such as <root>/v1.0-mini.
         name: of the scene.
     """
-    tables = _tables(folder)
+    tables = shared_tables(folder)
     scene = tables.scenes()[name]
     frames = scene_frames(tables, scene)
     expansion = _expansion(folder.parent / "maps" / "expansion" / f"{tables.location(scene)}.json")
@@ -65,14 +65,9 @@ def read_scene(folder: Path, name: str) -> Log:
 
 def scene_outline(folder: Path, name: str) -> LogOutline:
     """Return the key frames of a scene as `read_scene` does, without map and boxes; raises UserError like it."""
-    tables = _tables(folder)
+    tables = shared_tables(folder)
     scene = tables.scenes()[name]
     return LogOutline(name, "nuscenes", tables.location(scene), key_frames(scene_frames(tables, scene)))
-
-
-@functools.lru_cache(maxsize=1)
-def _tables(folder: Path) -> Tables:
-    return read_tables(folder)
 
 
 @functools.lru_cache(maxsize=4)

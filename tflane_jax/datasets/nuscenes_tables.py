@@ -8,6 +8,7 @@ https://github.com/nutonomy/nuscenes-devkit/blob/master/docs/schema_nuscenes.md
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -200,6 +201,21 @@ def find_tables(root: Path, version: str | None = None) -> Path:
         names = ", ".join(path.name for path in found)
         raise UserError(f"{root} holds several versions ({names}): name one of them as the folder")
     return found[0]
+
+
+def shared_tables(folder: Path) -> Tables:
+    """Return `read_tables` of a folder; while its files stay as they are, all callers share one copy.
+
+    Those of the full data set take gigabytes. Only the last folder's are kept.
+    """
+    folder = Path(folder)
+    paths = [folder / f"{table}.json" for table in TABLES]
+    return _shared(folder, tuple((p.stat().st_mtime_ns, p.stat().st_size) if p.is_file() else None for p in paths))
+
+
+@functools.lru_cache(maxsize=1)
+def _shared(folder: Path, files: tuple[tuple[int, int] | None, ...]) -> Tables:
+    return read_tables(folder)
 
 
 def read_tables(folder: Path) -> Tables:

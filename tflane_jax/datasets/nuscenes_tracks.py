@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from tflane_jax.datasets.nuscenes_log import Visibility, scene_frames, scene_log
-from tflane_jax.datasets.nuscenes_tables import find_tables, read_tables
+from tflane_jax.datasets.nuscenes_tables import find_tables, shared_tables
 from tflane_jax.errors import UserError
 from tflane_jax.scene.logs import Log
 
@@ -24,7 +24,7 @@ class SceneTracks:
     """
 
     def __init__(self, root: Path, version: str | None = None, least_visibility: Visibility = "v0-40"):
-        self.tables = read_tables(find_tables(root, version))
+        self.tables = shared_tables(find_tables(root, version))
         scenes = self.tables.scenes()
         self._scenes = {**{scene["token"]: scene for scene in scenes.values()}, **scenes}
         self._least_visibility: Visibility = least_visibility

@@ -2,18 +2,19 @@
 
 The content is written under a hidden temporary name beside its destination and then renamed. A reader sees the old
 content or the new one, never a part. A killed process leaves the destination as it was, and at most a file or folder
-named `.<name>.<process>-<number>.tmp`, behind which a writer may put a suffix of its own. What was renamed survives a
-power failure: the content is flushed to the device before, the folder after.
+named `.<name>.<process>-<random>.tmp`, behind which a writer may put a suffix of its own. Processes of several machines
+or containers, whose numbers may be equal, never share such a name. What was renamed survives a power failure: the
+content is flushed to the device before, the folder after.
 """
 
 from __future__ import annotations
 
 import contextlib
 import errno
-import itertools
 import json
 import os
 import re
+import secrets
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -21,8 +22,7 @@ from typing import Any
 
 from tflane_jax.errors import UserError
 
-_counter = itertools.count()
-_TEMPORARY = re.compile(r"\..+\.\d+-\d+\.tmp(\.\w+)?")
+_TEMPORARY = re.compile(r"\..+\.\d+-[\da-f]+\.tmp(\.\w+)?")
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 _FORBIDDEN = (errno.EACCES, errno.EPERM, errno.EROFS)
 
@@ -158,7 +158,7 @@ def is_temporary(path: Path | str) -> bool:
 
 
 def _temporary(path: Path) -> Path:
-    return path.with_name(f".{path.name}.{os.getpid()}-{next(_counter)}.tmp")
+    return path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}.tmp")
 
 
 def _replace_folder(new: Path, path: Path) -> None:

@@ -81,9 +81,17 @@ class Checkpoints:
 
     def best_step(self) -> int | None:
         """Return the step with the highest best metric (the earliest of equals), None if none was evaluated."""
-        scores = [(self.manifest(step).metrics.get(self._best_metric), -step) for step in self.steps()]
+        scores = [(self._score(step), -step) for step in self.steps()]
         found = [(score, negative) for score, negative in scores if score is not None and np.isfinite(score)]
         return -max(found)[1] if found else None
+
+    def _score(self, step: int) -> float | None:
+        try:
+            return self.manifest(step).metrics.get(self._best_metric)
+        except UserError:
+            if self.path(step).exists():
+                raise
+            return None  # the training dropped it since it was listed
 
     def save(self, state: TrainState, manifest: Manifest) -> Path:
         """Write a checkpoint and drop those that need not be kept.
@@ -97,14 +105,14 @@ class Checkpoints:
         writing = self.folder / f".writing-{os.getpid()}"
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            for stale in self.folder.glob(".writing-*"):  # left behind by a process that was killed
+            for stale in self.folder.glob(".writing-*"):  # left by a process that was killed: unfinished, or dropped
                 shutil.rmtree(stale, ignore_errors=True)
             save_arrays(writing / "state", _plain(state))
             content = asdict(manifest) | {"files": _checksums(writing)}
             content["progress"] = {**manifest.progress, _CONFIG_SUM: _sum_of(manifest.config)}
             (writing / "manifest.json").write_text(json.dumps(content, indent=1), encoding="utf-8")
             if place.is_dir():
-                shutil.rmtree(place)
+                self._drop(place)
             else:
                 place.unlink(missing_ok=True)
             rename_flushed(writing, place)
@@ -220,7 +228,13 @@ class Checkpoints:
         kept = {*steps[-self._keep :], self.best_step()}
         for step in steps:
             if step not in kept:
-                shutil.rmtree(self.path(step))
+                self._drop(self.path(step))
+
+    def _drop(self, place: Path) -> None:
+        """Delete a checkpoint; a process that is killed meanwhile leaves no part of one that looks like a whole."""
+        aside = self.folder / f".writing-{os.getpid()}-{place.name}"
+        place.rename(aside)
+        shutil.rmtree(aside)
 
     def damaged_progress(self, step: int, error: Exception) -> UserError:
         """Return the error for a checkpoint whose entry "progress" the loop cannot read."""

@@ -24,8 +24,19 @@ from tflane_jax.files.atomic import write_json
 
 _PACKAGES = ("tflane_jax", "jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "numpy", "scipy")
 
-# What decides how many threads XLA and the libraries below it use, beside the cores that a process may run on.
-_THREAD_VARIABLES = ("XLA_FLAGS", "OMP_NUM_THREADS", "NPROC", "PJRT_NPROC")
+# What decides how many threads XLA and the libraries below it use, beside the cores that a process may run on, and with
+# which random numbers and in which precision JAX computes.
+_VARIABLES = (
+    "XLA_FLAGS",
+    "OMP_NUM_THREADS",
+    "NPROC",
+    "PJRT_NPROC",
+    "JAX_DEFAULT_PRNG_IMPL",
+    "JAX_THREEFRY_PARTITIONABLE",
+    "JAX_DEFAULT_MATMUL_PRECISION",
+    "JAX_ENABLE_X64",
+    "NVIDIA_TF32_OVERRIDE",
+)
 _CPU = "cpu:"
 
 
@@ -37,7 +48,7 @@ def thread_setting(cores: int | None = None, devices: int | None = None) -> dict
     """
     if cores is None:
         cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    setting = {"cores": cores} | {name: os.environ[name] for name in _THREAD_VARIABLES if name in os.environ}
+    setting = {"cores": cores} | {name: os.environ[name] for name in _VARIABLES if name in os.environ}
     device = _device(devices)
     return setting if device.startswith(_CPU) else setting | {"device": device}
 

@@ -20,6 +20,7 @@ from tflane_jax.config_io import first_difference
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import check_writable, is_temporary
 from tflane_jax.files.fields import load_json
+from tflane_jax.startup import write
 
 Start = Literal["new", "resume", "overwrite"]
 CurrentForm = Callable[[dict[str, Any]], tuple[dict[str, Any], list[str]]]
@@ -65,11 +66,25 @@ def check_unchanged(folder: Path, resolved: dict[str, Any], current_form: Curren
     saved, notices = read_config(folder), []
     if current_form is not None:
         saved, notices = current_form(saved)
-    if difference := first_difference(fixed(saved), fixed(resolved)):
+    if difference := first_difference(fixed(with_same_origin(saved, resolved, folder)), fixed(resolved)):
         raise UserError(
             f"{folder} was started with another configuration ({difference}): resume it as it is, or start another run"
         )
     return notices
+
+
+def with_same_origin(saved: dict[str, Any], resolved: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """Return a saved configuration (JSON) with `training.init_from` as `resolved` has it, where both mean one run.
+
+    That is a run beside `folder`. Where it lies is told by its name alone, because a folder of runs may be moved, or
+    have another path on another machine.
+    """
+    old, new = (config.get("training", {}).get("init_from") for config in (saved, resolved))
+    if not isinstance(old, str) or not isinstance(new, str) or Path(old).name != Path(new).name:
+        return saved
+    if Path(new).parent.resolve() != folder.parent.resolve():
+        return saved
+    return saved | {"training": saved["training"] | {"init_from": new}}
 
 
 @contextlib.contextmanager
@@ -100,8 +115,8 @@ def claimed(folder: Path, start: Start) -> Iterator[None]:
 
 def check_start(folder: Path, start: Start) -> None:
     """Raise UserError where `claimed` would, as far as can be told beforehand; nothing is written."""
-    holds_run = (folder / "config.json").exists()
     check_writable(folder / "run.lock")
+    holds_run = (folder / "config.json").exists()
     if is_locked(folder):
         raise _in_use(folder)
     if start == "new" and holds_run:
@@ -135,6 +150,8 @@ def _lock(file: int, folder: Path) -> None:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError as error:
         raise _in_use(folder) from error
+    except OSError as error:
+        write(f"{folder}: this file system has no locks ({error.strerror}): see to it that one process trains there")
 
 
 def _in_use(folder: Path) -> UserError:

@@ -17,3 +17,9 @@ ArrayT = TypeVar("ArrayT", np.ndarray, jax.Array)
 def namespace(*arrays: Any) -> ModuleType:
     """Return `jax.numpy` if any argument is a jax array or tracer, else `numpy`."""
     return jnp if any(isinstance(a, jax.Array) for a in arrays) else np
+
+
+def constants(values: Any, like: Any) -> Any:
+    """Return constants as an array of the library of `like`, of its dtype or, if that is no floating one, float32."""
+    dtype = like.dtype if jnp.issubdtype(like.dtype, jnp.floating) else np.float32
+    return namespace(like).asarray(values, dtype)

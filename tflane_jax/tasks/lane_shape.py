@@ -46,7 +46,7 @@ from tflane_jax.models.lstr import LstrConfig, normalise
 from tflane_jax.models.lstr_init import lstr_init
 from tflane_jax.models.parameters import Params, joined_statistics, split_statistics
 from tflane_jax.scene import CurvePrediction, LaneLines, Prediction, RoadImage, shapes_of, stack_examples
-from tflane_jax.tasks.base import Draw, Model, Task, Terms, spread
+from tflane_jax.tasks.base import Draw, Model, Recorded, Task, spread
 from tflane_jax.tasks.edge_types import save_edge_types
 from tflane_jax.world.front_view.lines import CAPACITY, ROWS
 
@@ -87,8 +87,13 @@ class LaneShapeTask(Task[RoadImage, LabelledImages, ImageSource, None]):
         params = joined_statistics(self.model.build().init(key, image, example.image_valid))
         return lstr_init(params, key) if self.model.init == "lstr" else params
 
-    def loss(self, params: Params, batch: RoadImage, key: jax.Array) -> tuple[Float[Array, ""], Terms]:
-        """Return the loss of a batch (leading axis on every leaf) and its terms; norms use batch statistics."""
+    def loss(self, params: Params, batch: RoadImage, key: jax.Array) -> tuple[Float[Array, ""], Recorded]:
+        """Return the loss of a batch (leading axis on every leaf) and its terms; norms use batch statistics.
+
+        Raises ValueError for anything but a batch.
+        """
+        if len(shape := np.shape(batch.image)) != 4:
+            raise ValueError(f"expected a batch (image of shape (batch, h, w, 3)), but it is of shape {shape}")
         learned, statistics = split_statistics(params)
         module, keys = self.model.build(), jax.random.split(key, len(batch.image))
 

@@ -227,7 +227,7 @@ def found_lanes(prediction: CurvePrediction, truth: RowLanes, threshold: float |
     """Return the lanes of one prediction at the rows of the truth; `threshold` as of `lane_shapes.detected`."""
     assert truth.rows is not None, "labels have rows"
     height, width = truth.size
-    return lane_shapes.row_lanes(prediction, truth.rows, height=height, width=width, threshold=threshold)
+    return lane_shapes.detections_of_curves(prediction, truth.rows, height=height, width=width, threshold=threshold)
 
 
 def predict_curves(

@@ -7,4 +7,5 @@ configs = [f"tflane_jax.{name}" for name in find_namespace_packages(include=["co
 setup(
     packages=[*find_packages(include=["tflane_jax", "tflane_jax.*"]), *configs],
     package_dir={"tflane_jax.configs": "configs"},
+    package_data={"tflane_jax": ["py.typed"]},  # type checkers read the annotations
 )

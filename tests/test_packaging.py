@@ -37,6 +37,8 @@ def installed(tmp_path_factory):
         target.mkdir(parents=True, exist_ok=True)
         for path in _source(package, given["package_dir"]).glob("*.py"):
             shutil.copy(path, target)
+        for name in given["package_data"].get(package, ()):
+            shutil.copy(ROOT / package / name, target)
     return site
 
 
@@ -59,3 +61,7 @@ def test_packed_configurations_load_by_name(installed, tmp_path):
     done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert done.stdout.split() == list(shipped_configs())
+
+
+def test_type_checkers_are_told_of_the_annotations(installed):
+    assert (installed / "tflane_jax" / "py.typed").is_file()

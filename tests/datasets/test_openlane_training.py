@@ -22,7 +22,7 @@ from tflane_jax.datasets.photometric import PhotometricConfig
 from tflane_jax.datasets.streaming import StreamingConfig
 from tflane_jax.datasets.view_images import ImageConfig
 from tflane_jax.errors import UserError
-from tflane_jax.evaluation.centerlines import detections_from_prediction
+from tflane_jax.evaluation.centerlines import detections_of_centerlines
 from tflane_jax.evaluation.predict import predictions
 from tflane_jax.markers.simulation import PERFECT, MarkerConfig
 from tflane_jax.models.priors import PriorsConfig
@@ -172,7 +172,7 @@ def test_a_submission_holds_what_the_model_predicts(data, tmp_path, capsys):
     for indices, answers in predictions(config.task, run.params[0], arrays, 8):
         for row, index in enumerate(indices):
             answer = jax.tree.map(lambda leaf, i=row: leaf[i], answers)
-            wanted, found = detections_from_prediction(answer.centerlines, answer.elements), written[keys[index]]
+            wanted, found = detections_of_centerlines(answer.centerlines, answer.elements), written[keys[index]]
             np.testing.assert_allclose(np.array(found.points), wanted.points, rtol=1e-4, atol=1e-3)
             np.testing.assert_allclose(found.scores, wanted.scores, atol=1e-4)
             np.testing.assert_allclose(found.successor, wanted.successor, atol=1e-4)

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from tflane_jax.evaluation.lane_segments import detections_of_segments, segment_detections, segment_truth
+from tflane_jax.evaluation.lane_segments import detections_of_segments, segment_detections, truth_of_segments
 from tflane_jax.metrics import ElementDetections, LaneSegmentMetrics
 from tflane_jax.scene import AreaPrediction, Areas, AreaType, LaneGraph, SegmentPrediction, TrafficElements
 
@@ -55,7 +55,7 @@ def scene(garbage=np.nan):
 
 def test_truth_holds_what_is_valid():
     segments, lanes, areas, elements = scene()
-    truth = segment_truth(segments, areas, elements, lanes)
+    truth = truth_of_segments(segments, areas, elements, lanes)
     for ours, theirs in (
         (truth.lanes.points, segments.points),
         (truth.left, segments.left),
@@ -70,25 +70,25 @@ def test_truth_holds_what_is_valid():
     np.testing.assert_array_equal(truth.lanes.elements.boxes, elements.box[1:])
     # Element 1 governs the merged centerline, so both its segments; element 2 the lane beside it.
     np.testing.assert_array_equal(truth.lanes.elements.lane, [[True, False], [True, False], [False, True]])
-    assert segment_truth(segments, areas).lanes.elements is None
+    assert truth_of_segments(segments, areas).lanes.elements is None
 
 
 def test_rows_of_the_elements_may_be_the_segments():
     segments, lanes, areas, elements = scene()
     direct = dataclasses.replace(elements, lane=np.eye(4, 3, dtype=bool)[[1, 0, 2, 2]])
-    truth = segment_truth(segments, areas, direct)
+    truth = truth_of_segments(segments, areas, direct)
     assert truth.lanes.elements is not None
     np.testing.assert_array_equal(truth.lanes.elements.lane, [[True, False], [False, True], [False, True]])
     with pytest.raises(ValueError, match=r"3 rows, expected one for each of 4 segments"):
-        segment_truth(segments, areas, elements)
+        truth_of_segments(segments, areas, elements)
     with pytest.raises(ValueError, match=r"4 rows, expected one for each of 3 centerlines"):
-        segment_truth(segments, areas, direct, lanes)
+        truth_of_segments(segments, areas, direct, lanes)
 
 
 def perfect(garbage=0.0, successor=None):
     """Return detections equal to the truth of `scene`, its crossing as a query of the second class."""
     segments, lanes, areas, elements = scene()
-    truth = segment_truth(segments, areas, elements, lanes)
+    truth = truth_of_segments(segments, areas, elements, lanes)
     crossing = np.asarray(truth.areas.points[0])
     left, right = crossing[[2, 3, 4, 5, 6]], crossing[[0, 0, 1, 8, 8]][::-1]
     points = [np.concatenate([np.asarray(x), y[None]]) for x, y in ((truth.left, left), (truth.right, right))]
@@ -136,7 +136,7 @@ def test_perfect_detections_get_the_full_score():
 def test_padding_and_invalid_queries_change_nothing():
     segments, lanes, areas, elements = scene(0.0)
     arrays, found, truth = perfect()
-    shown = truth, segment_truth(segments, areas, elements, lanes)
+    shown = truth, truth_of_segments(segments, areas, elements, lanes)
     padded = [np.concatenate([array, np.full((1, *array.shape[1:]), 7, array.dtype)]) for array in arrays[:5]]
     edges = np.pad(arrays[5], (0, 1), constant_values=np.nan)
     more = dataclasses.replace(found, lane=np.concatenate([found.lane, np.full((1, 2), np.nan)]))
@@ -153,7 +153,7 @@ def test_padding_and_invalid_queries_change_nothing():
 
 
 def test_empty_input():
-    empty = segment_truth(LaneGraph.empty(3, 5), Areas.empty(2, 9), TrafficElements.empty(2, 3))
+    empty = truth_of_segments(LaneGraph.empty(3, 5), Areas.empty(2, 9), TrafficElements.empty(2, 3))
     line = np.zeros((0, 5, 3))
     none = segment_detections(line, line, line, np.zeros(0, int), np.zeros(0), np.zeros((0, 0)))
     metrics = LaneSegmentMetrics("LaneSegNet")
@@ -166,7 +166,7 @@ def test_empty_input():
 def test_areas_of_their_own_are_measured_by_class():
     """Perfect areas get the full score; the two classes exchanged get none."""
     segments, _, areas, _ = scene(0.0)
-    truth = segment_truth(segments, areas)
+    truth = truth_of_segments(segments, areas)
     rows = np.flatnonzero(areas.valid)
     logits = np.where(np.arange(2) == areas.category[rows, None] - 1, 4.0, -4.0)
     queries = SegmentPrediction(

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from tflane_jax.evaluation.vector_maps import dividers, map_detections, map_truth
+from tflane_jax.evaluation.vector_maps import dividers, map_detections, truth_of_segment_lines
 from tflane_jax.metrics import VectorMapMetrics
 from tflane_jax.scene import Areas, AreaType, LaneGraph, LineType
 
@@ -64,7 +64,7 @@ def test_the_longer_of_two_lines_stays(shift, expected):
 
 def test_truth_joins_dividers_crossings_and_boundaries():
     segments = graph((straight(4), straight(0), SOLID, DASHED))
-    truth = map_truth(segments, areas())
+    truth = truth_of_segment_lines(segments, areas())
     np.testing.assert_array_equal(truth.classes, [0, 0, 2, 1])
     for line, expected in zip(truth.points, [straight(4), straight(0), *areas().points[1:]], strict=True):
         np.testing.assert_allclose(line, expected[:, :2])
@@ -77,7 +77,7 @@ def score(detections, truth):
 
 
 def test_perfect_detections_get_the_full_score_in_any_order():
-    truth = map_truth(graph((straight(4), straight(0), SOLID, DASHED)), areas())
+    truth = truth_of_segment_lines(graph((straight(4), straight(0), SOLID, DASHED)), areas())
     points = np.concatenate([np.stack(list(truth.points)), np.ones((4, 5, 1))], -1)[::-1]
     found = map_detections(points, truth.classes[::-1], np.array([0.1, 0.4, 0.3, 0.2]))
     np.testing.assert_array_equal(found.scores, [0.4, 0.3, 0.2, 0.1])
@@ -97,7 +97,7 @@ def test_padding_changes_no_metric():
         np.array([False, True, True]),
     )
     results = [
-        score(detections, map_truth(graph(segments, garbage=garbage), areas(garbage)))
+        score(detections, truth_of_segment_lines(graph(segments, garbage=garbage), areas(garbage)))
         for detections, garbage in ((found, np.nan), (padded, 0.0))
     ]
     assert results[0] == results[1]
@@ -105,7 +105,7 @@ def test_padding_changes_no_metric():
 
 
 def test_empty_input():
-    truth = map_truth(LaneGraph.empty(2, 5), Areas.empty(2, 5))
+    truth = truth_of_segment_lines(LaneGraph.empty(2, 5), Areas.empty(2, 5))
     none = map_detections(np.zeros((0, 5, 2)), np.zeros(0, int), np.zeros(0))
     result = score(none, truth)
     assert (result["lines"], result["mAP"]) == (0, 0.0)

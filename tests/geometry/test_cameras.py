@@ -98,3 +98,12 @@ def test_ground_points_of_few_pixels(count):
     ground, valid = ground_points(np.full((count, 2), 600.0), INTRINSICS, CAMERA)
     assert ground.shape == (count, 3)
     assert valid.all()
+
+
+@pytest.mark.parametrize("array", [np.asarray, jnp.asarray])
+def test_intrinsics_of_whole_numbers_are_those_of_floats(array):
+    intrinsics = np.array([[1000, 0, 800], [0, 1000, 450], [0, 0, 1]])
+    exact = intrinsics.astype(np.float64)
+    resized, cropped = resize_intrinsics(array(intrinsics), (0.5, 0.25)), crop_intrinsics(array(intrinsics), (0.5, 1.5))
+    np.testing.assert_allclose(resized, resize_intrinsics(exact, (0.5, 0.25)))
+    np.testing.assert_allclose(cropped, crop_intrinsics(exact, (0.5, 1.5)))

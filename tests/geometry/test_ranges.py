@@ -45,3 +45,13 @@ def test_device_equals_host_with_points_of_any_rank():
     with jax.numpy_rank_promotion("raise"):
         for function in (RANGE.normalise, RANGE.denormalise, RANGE.contains, grid.pixel):
             np.testing.assert_allclose(jax.jit(function)(jnp.asarray(points)), function(points), rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("array", [np.asarray, jnp.asarray])
+def test_whole_numbers_give_what_floats_give(array):
+    """The borders of this range are no whole numbers."""
+    grid = BevGrid(PerceptionRange((-51.2, 51.2), (-25.6, 25.6), (-2.3, 1.7)))
+    points = np.array([[3, -7, 1], [0, 0, 0], [1, 1, 1]])
+    for function in (grid.range.normalise, grid.range.denormalise, grid.pixel):
+        found, expected = function(array(points)), function(points.astype(np.float64))
+        np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-5)

@@ -290,3 +290,15 @@ def test_gradients_have_the_dtypes_of_what_they_belong_to():
         given = query.astype(jnp.float64), key, value
         gradients = jax.grad(lambda *x: masked_attention(*x).sum(), (0, 1, 2))(*given)
     assert [g.dtype for g in gradients] == [x.dtype for x in given]
+
+
+@pytest.mark.parametrize("dtype", ["float32", "int32"])
+def test_masks_of_numbers_are_refused(dtype):
+    """An additive mask, 0 and -inf, would be read inverted."""
+    x = jnp.ones((HEADS, 5, 4))
+    mask = np.zeros((5, 5), dtype)
+    for attend in (masked_attention, lambda q, k, v, m: attention_probabilities(q, k, m)):
+        with pytest.raises(TypeError, match=f"mask is {dtype}: it must be bool, true where a query may attend"):
+            attend(x, x, x, mask)
+    with pytest.raises(TypeError, match=f"mask is {dtype}"):
+        MultiHeadAttention(8, 2).init(jax.random.key(0), x[0], x[0], x[0], mask)

@@ -181,3 +181,9 @@ def test_no_capacity_is_no_target(backend):
     )
     np.testing.assert_allclose(none[0], full[0], rtol=1e-6)
     assert full[0] > 0.0
+
+
+def test_a_loss_of_one_example_is_refused():
+    lanes = CenterlinePrediction(np.zeros((1, 6, 11, 3)), np.zeros((1, 6, 1)))
+    with pytest.raises(ValueError, match=r"expected a batch \(lanes\.valid of shape \(batch, n\)\)"):
+        lane_graph_loss(Prediction(lanes), LaneGraph.empty(8, 11), CONFIG)

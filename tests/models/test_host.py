@@ -29,7 +29,7 @@ from tflane_jax.models.lanesegnet import LaneSegNetConfig
 from tflane_jax.models.maptr import MapTrConfig
 from tflane_jax.models.maptrv2 import MapTrV2Config
 from tflane_jax.models.priors import PriorsConfig
-from tflane_jax.scene import TrafficFlow
+from tflane_jax.scene import TrafficFlow, stack_examples
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 
 MODELS = {
@@ -188,3 +188,15 @@ def test_no_bev_is_an_error():
     task, params, _ = fit("baseline")
     with pytest.raises(UserError, match="bev is None"):
         task.predict(params, make_line_example().replace(bev=None))
+
+
+def test_what_is_for_one_example_and_what_for_a_batch_is_said():
+    task, params, _ = fit("baseline")
+    example = make_line_example()
+    batch = stack_examples([example, example])
+    with pytest.raises(ValueError, match=r"expected one example .*of shape \(2, 4, 4\); jax\.vmap adds batches"):
+        task.predict(params, batch)
+    clips = LaneGraphTask(BASELINE, clip=3)
+    for one, tried, shape in ((task, example, r"\(batch, 4, 4\)"), (clips, batch, r"\(batch, 3, 4, 4\)")):
+        with pytest.raises(ValueError, match=rf"expected a batch \(previous_from_ego of shape {shape}\)"):
+            one.loss(params, tried, jax.random.key(0))

@@ -13,7 +13,7 @@ from tests.golden_compare import assert_outputs_close, compare
 from tests.shared import shared_path, shared_root
 from tflane_jax.convert.lstr import convert_lstr
 from tflane_jax.datasets.tusimple import TuSimpleConfig, TuSimpleDataset
-from tflane_jax.evaluation.lane_shapes import detected, row_lanes
+from tflane_jax.evaluation.lane_shapes import detected, detections_of_curves
 from tflane_jax.layers.batch_norm import BATCH_AXIS
 from tflane_jax.layers.resnet import ResNetConfig
 from tflane_jax.layers.transformer import TransformerConfig
@@ -133,7 +133,7 @@ def test_published_weights_match_the_reference(path):
         np.testing.assert_array_equal(found, case.outputs["results"][b, :, 0] == 1)
         for name in numbered(case.inputs, r"h_samples_(\d+)"):
             heights, rows = name.removeprefix("h_samples_"), case.inputs[name]
-            ours = row_lanes(one, rows, height=720, width=1280).x
+            ours = detections_of_curves(one, rows, height=720, width=1280).x
             expected = case.outputs[f"b{b}.tusimple_x_h{heights}"]
             np.testing.assert_array_equal(ours == -2, expected == -2)
             np.testing.assert_allclose(ours, expected, atol=0.05)  # pixels
@@ -219,7 +219,7 @@ def test_the_ten_real_frames_give_the_originals_points():
         ours = jax.tree.map(lambda leaf, i=i: leaf[i, -1], prediction)
         theirs = CurvePrediction(reference["pred_logits"][i], reference["pred_curves"][i])
         truth = dataset.truth(i)
-        found, expected = (row_lanes(one, truth.rows, height=720, width=1280) for one in (ours, theirs))
+        found, expected = (detections_of_curves(one, truth.rows, height=720, width=1280) for one in (ours, theirs))
         np.testing.assert_array_equal(found.x == -2, expected.x == -2)
         np.testing.assert_allclose(found.x, expected.x, atol=0.5)  # pixels
         metrics.update(found, truth)

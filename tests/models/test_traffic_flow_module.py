@@ -209,6 +209,7 @@ def test_the_example_of_a_model_of_ones_own_reads_traffic():
     model = names["WithTraffic"](HostSpec(64, PerceptionRange(), BevGrid().range))
     some, other = (jax.tree.map(jnp.asarray, make_flow(seed, instances=4)) for seed in (1, 2))
     params = random_params(model.init, some, queries, queries, lines)
+    assert set(params["params"]) == {"temporal_encoder", "spatial_encoder_0"}  # as in a host, whose parameters fit
     outputs = [np.asarray(apply(model, params, flow, queries, queries, lines)) for flow in (some, other)]
     assert outputs[0].shape == (LANES, 64)
     assert np.abs(outputs[0] - outputs[1]).max() > 1e-3

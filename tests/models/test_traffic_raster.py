@@ -139,5 +139,5 @@ def test_without_the_setting_there_is_no_hook():
 
 
 def test_traffic_that_enters_nowhere_is_refused():
-    with pytest.raises(UserError, match="enters nowhere"):
+    with pytest.raises(UserError, match=r"^insert is 'nowhere'.*enters nowhere"):
         TrafficFlowConfig(insert="nowhere").build(BASELINE.spec)

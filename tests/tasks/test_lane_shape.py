@@ -219,3 +219,8 @@ def test_images_that_do_not_shrink_by_whole_blocks_are_named():
     LaneShapeTask(dataclasses.replace(tiny_model(), shrink=8)).check_settings(data)
     with pytest.raises(UserError, match=r"task\.model\.shrink is 7: it must be a divisor of 360 and 640"):
         LaneShapeTask(dataclasses.replace(tiny_model(), shrink=7)).check_settings(data)
+
+
+def test_a_loss_of_one_image_is_refused():
+    with pytest.raises(ValueError, match=r"expected a batch \(image of shape \(batch, h, w, 3\)\)"):
+        tiny_task().loss({}, road_image(0), jax.random.key(0))

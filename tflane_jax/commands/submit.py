@@ -13,7 +13,7 @@ from tflane_jax.commands.sources import opened, source_for
 from tflane_jax.datasets.nuscenes import NuScenesConfig, NuScenesDataset
 from tflane_jax.datasets.openlane_v2 import OpenLaneV2Config, OpenLaneV2Dataset
 from tflane_jax.errors import UserError
-from tflane_jax.evaluation.centerlines import detections_from_prediction
+from tflane_jax.evaluation.centerlines import detections_of_centerlines
 from tflane_jax.evaluation.lane_segments import detections_of_segments
 from tflane_jax.evaluation.predict import predicted_batches
 from tflane_jax.evaluation.vector_maps import detections_of_lines
@@ -102,4 +102,4 @@ def _record(dataset: OpenLaneV2Dataset, answer: Prediction) -> dict[str, Any]:
     if answer.segments is not None:
         return segment_record(detections_of_segments(answer.segments, elements))
     assert answer.centerlines is not None
-    return centerline_record(detections_from_prediction(answer.centerlines, elements))
+    return centerline_record(detections_of_centerlines(answer.centerlines, elements))

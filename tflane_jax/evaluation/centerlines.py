@@ -10,7 +10,7 @@ from tflane_jax.metrics.frames import ElementDetections, ElementTruth, LaneDetec
 from tflane_jax.scene import CenterlinePrediction, ElementPrediction, LaneGraph, TrafficElements
 
 
-def truth_from_example(lanes: LaneGraph, elements: TrafficElements | None = None) -> LaneTruth:
+def truth_of_centerlines(lanes: LaneGraph, elements: TrafficElements | None = None) -> LaneTruth:
     """Return the valid lanes (and traffic elements) of one example."""
     keep = np.flatnonzero(np.asarray(lanes.valid))
     truth = None
@@ -29,7 +29,7 @@ def truth_from_example(lanes: LaneGraph, elements: TrafficElements | None = None
     )
 
 
-def detections_from_prediction(
+def detections_of_centerlines(
     prediction: CenterlinePrediction, elements: ElementPrediction | None = None
 ) -> LaneDetections:
     """Return the lanes (and traffic elements) of all queries of ONE example's last layer, best score first.
@@ -44,11 +44,13 @@ def detections_from_prediction(
         points=np.asarray(prediction.points)[order],
         scores=scores[order],
         successor=np.zeros((len(order),) * 2) if edges is None else expit(np.asarray(edges)[np.ix_(order, order)]),
-        elements=None if elements is None else element_detections(elements, order),
+        elements=None if elements is None else detections_of_elements(elements, order),
     )
 
 
-def element_detections(elements: ElementPrediction, lanes: Int[np.ndarray, " p"] | None = None) -> ElementDetections:
+def detections_of_elements(
+    elements: ElementPrediction, lanes: Int[np.ndarray, " p"] | None = None
+) -> ElementDetections:
     """Return the traffic elements, best score first, with lanes in the given order (None: query order).
 
     Raises ValueError if the prediction has no lane-element topology.

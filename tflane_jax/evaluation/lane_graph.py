@@ -22,11 +22,11 @@ from jaxtyping import Bool, Float
 from tflane_jax.datasets.batches import ordered_batches
 from tflane_jax.datasets.streaming import Streamed
 from tflane_jax.evaluation.by_scene import counted_ratio, scene_numbers, shared_samples, summed_ratio
-from tflane_jax.evaluation.centerlines import detections_from_prediction, truth_from_example
+from tflane_jax.evaluation.centerlines import detections_of_centerlines, truth_of_centerlines
 from tflane_jax.evaluation.geometric_topology import with_geometric_topology
 from tflane_jax.evaluation.interventions import with_traffic
 from tflane_jax.evaluation.lane_groups import LANE_GROUPS, lane_groups, line_groups
-from tflane_jax.evaluation.lane_segments import detections_of_segments, segment_truth
+from tflane_jax.evaluation.lane_segments import detections_of_segments, truth_of_segments
 from tflane_jax.evaluation.map_metrics import LineLabel, MapLineMetrics
 from tflane_jax.evaluation.predict import FOR_SCORES, Predictor, predicted_batches
 from tflane_jax.evaluation.results import EvaluationConfig, SceneRatio, SceneSamples
@@ -118,13 +118,13 @@ class LaneGraphMetrics:
         found, true = (prediction.elements, example.traffic_elements) if both else (None, None)
         members = members or {}
         if prediction.centerlines is not None:
-            detections = detections_from_prediction(prediction.centerlines, found)
-            lanes = truth_from_example(example.lanes, true)
+            detections = detections_of_centerlines(prediction.centerlines, found)
+            lanes = truth_of_centerlines(example.lanes, true)
             self._centerlines.update(detections, lanes, frame_group, members.get("centerlines"))
         if prediction.segments is not None:
             # Elements govern segments, or the centerlines on which segments lie.
             own = true is None or len(true.lane) == len(example.segments.valid)
-            segments = segment_truth(example.segments, example.areas, true, None if own else example.lanes)
+            segments = truth_of_segments(example.segments, example.areas, true, None if own else example.lanes)
             frame = match_segments(detections_of_segments(prediction.segments, found), segments, nearest="all")
             self._segments.add(frame, segments.lanes, frame_group, members.get("segments"))
             self._devkit.add(frame)

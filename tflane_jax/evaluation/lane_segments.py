@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.special import expit
 
 from tflane_jax.datasets.openlane_export import segments_on_lanes
-from tflane_jax.evaluation.centerlines import element_detections
+from tflane_jax.evaluation.centerlines import detections_of_elements
 from tflane_jax.metrics.frames import ElementDetections, ElementTruth, LaneDetections, LaneTruth
 from tflane_jax.metrics.segment_matching import CROSSING, AreaDetections, AreaTruth, SegmentDetections, SegmentTruth
 from tflane_jax.scene import (
@@ -26,7 +26,7 @@ SEGMENT_CLASSES = ("lane_segment", "ped_crossing")
 """Classes of LaneSegNet's queries."""
 
 
-def segment_truth(
+def truth_of_segments(
     segments: LaneGraph, areas: Areas, elements: TrafficElements | None = None, lanes: LaneGraph | None = None
 ) -> SegmentTruth:
     """Return the valid lane segments, areas and traffic elements of one example.
@@ -126,14 +126,14 @@ def detections_of_segments(segments: SegmentPrediction, elements: ElementPredict
         confidence.argmax(-1),
         confidence.max(-1),
         np.zeros((len(confidence),) * 2) if edges is None else expit(np.asarray(edges)),
-        elements=None if elements is None else element_detections(elements),
+        elements=None if elements is None else detections_of_elements(elements),
         left_type=left_type,
         right_type=right_type,
     )
-    return detections if segments.areas is None else replace(detections, areas=area_detections(segments.areas))
+    return detections if segments.areas is None else replace(detections, areas=detections_of_areas(segments.areas))
 
 
-def area_detections(areas: AreaPrediction) -> AreaDetections:
+def detections_of_areas(areas: AreaPrediction) -> AreaDetections:
     """Return the last decoder layer's areas of one example, best score first, each query with its best class."""
     confidence = expit(np.asarray(areas.logits))
     order = np.argsort(-confidence.max(-1), kind="stable")

@@ -7,22 +7,16 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.special import softmax
 
 from tflane_jax.files.tusimple import NO_POINT, RowLanes
 from tflane_jax.geometry.lane_shapes import curve_columns
 from tflane_jax.scene import CurvePrediction
 
 
-def lane_scores(prediction: CurvePrediction) -> Float[np.ndarray, " q"]:
-    """Return the probability that each query is a lane (numpy, one example, one layer)."""
-    return softmax(np.asarray(prediction.logits), -1)[..., 1]
-
-
 def detected(prediction: CurvePrediction, threshold: float | None = None) -> Bool[np.ndarray, " q"]:
     """Return which queries are lanes: those with at least this score; by default, where lane exceeds background."""
     if threshold is not None:
-        return lane_scores(prediction) >= threshold
+        return np.asarray(prediction.scores) >= threshold
     logits = np.asarray(prediction.logits)
     return logits[..., 1] > logits[..., 0]
 
@@ -35,7 +29,7 @@ def left_to_right(prediction: CurvePrediction, threshold: float | None = None) -
     return queries[np.argsort(ends, kind="stable")]
 
 
-def row_lanes(
+def detections_of_curves(
     prediction: CurvePrediction,
     rows: Float[np.ndarray, " h"],
     *,

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from tflane_jax.evaluation.line_tracks import LineTracks
-from tflane_jax.evaluation.vector_maps import detections_of_lines, map_truth, truth_of_lines
+from tflane_jax.evaluation.vector_maps import detections_of_lines, truth_of_lines, truth_of_segment_lines
 from tflane_jax.metrics.consistency import CONFIDENT, MapConsistency
 from tflane_jax.metrics.groups import BY_OCCLUSION, FrameGroup
 from tflane_jax.metrics.map_matching import Dims, MatchedMap, Measure, match_map
@@ -79,7 +79,7 @@ class MapLineMetrics:
         """
         lines = replace(lines, points=lines.points[..., : self._dims])
         detections = detections_of_lines(lines)
-        truth = map_truth(example.segments, example.areas)
+        truth = truth_of_segment_lines(example.segments, example.areas)
         if example.map_lines is not None:
             truth = truth_of_lines(example.map_lines, lines)
         frame = match_map(detections, truth, dims=self._dims, nearest="all")

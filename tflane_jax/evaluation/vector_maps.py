@@ -15,7 +15,7 @@ _DIVIDER, _CROSSING, _BOUNDARY = (CLASSES.index(name) for name in ("divider", "p
 _SAME_LINE = 0.2
 
 
-def map_truth(segments: LaneGraph, areas: Areas) -> MapTruth:
+def truth_of_segment_lines(segments: LaneGraph, areas: Areas) -> MapTruth:
     """Return the map lines of one example: `dividers` of its lane segments, crossings and road boundaries of its areas.
 
     Points are (x, y), metres, ego frame. Closed lines repeat their first vertex, as in `Areas`.

@@ -1,7 +1,7 @@
 """Poses, polylines, ranges and cameras as pure array functions, without parameters and without files.
 
-Functions return arrays of the library of their arguments, numpy or jax. The same line runs in float64 on the host and
-under jit.
+Poses, ranges and cameras return arrays of the library of their arguments, so the same line runs in float64 on the host
+and under jit. Polylines and `wrap_angle` are numpy only.
 """
 
 from tflane_jax.geometry.cameras import (

@@ -11,7 +11,7 @@ from typing import Any
 
 from jaxtyping import Bool, Float
 
-from tflane_jax.geometry.namespace import AnyArray, ArrayT, namespace, product
+from tflane_jax.geometry.namespace import AnyArray, ArrayT, constants, namespace, product
 from tflane_jax.geometry.poses import invert_pose, transform_points
 
 MIN_DEPTH = 1e-5
@@ -70,11 +70,10 @@ def inside_image(pixels: Float[ArrayT, "*b 2"], width: int, height: int) -> Bool
 def resize_intrinsics(intrinsics: Float[ArrayT, "*b 3 3"], scale: tuple[float, float]) -> Float[ArrayT, "*b 3 3"]:
     """Return the intrinsics after the image's width and height were multiplied by `scale`."""
     xp = namespace(intrinsics)
-    return xp.diag(xp.asarray([*scale, 1.0], intrinsics.dtype)) @ intrinsics
+    return xp.diag(constants([*scale, 1.0], intrinsics)) @ intrinsics
 
 
 def crop_intrinsics(intrinsics: Float[ArrayT, "*b 3 3"], corner: tuple[float, float]) -> Float[ArrayT, "*b 3 3"]:
     """Return the intrinsics after the image was cut so that pixel `corner` (u, v) became its top-left corner."""
-    xp = namespace(intrinsics)
     u, v = corner
-    return xp.asarray([[1.0, 0.0, -u], [0.0, 1.0, -v], [0.0, 0.0, 1.0]], intrinsics.dtype) @ intrinsics
+    return constants([[1.0, 0.0, -u], [0.0, 1.0, -v], [0.0, 0.0, 1.0]], intrinsics) @ intrinsics

@@ -25,3 +25,9 @@ def product(a: Any, b: Any) -> Any:
     By default accelerators may round the factors to ten bits or seven, which moves points metres away by centimetres.
     """
     return jnp.matmul(a, b, precision="highest") if namespace(a, b) is jnp else a @ b
+
+
+def constants(values: Any, like: Any) -> Any:
+    """Return constants as an array of the library of `like`, of its dtype or, if that is no floating one, float32."""
+    dtype = like.dtype if jnp.issubdtype(like.dtype, jnp.floating) else np.float32
+    return namespace(like).asarray(values, dtype)

@@ -7,11 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float, Int
 
-from tflane_jax.geometry.namespace import AnyArray
 from tflane_jax.geometry.ranges import PerceptionRange
 
 
-def arc_length(points: Float[AnyArray, "n d"]) -> Float[np.ndarray, " n"]:
+def arc_length(points: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " n"]:
     """Return the **ground plane** (x, y) distance from the first point to each point along the line, metres.
 
     Lengths are 2-D even for 3-D lines, as in the OpenLane-V2 tools.
@@ -20,7 +19,7 @@ def arc_length(points: Float[AnyArray, "n d"]) -> Float[np.ndarray, " n"]:
     return np.concatenate([[0.0], np.cumsum(steps)])
 
 
-def resample(points: Float[AnyArray, "n d"], count: int) -> Float[np.ndarray, "count d"]:
+def resample(points: Float[np.ndarray, "n d"], count: int) -> Float[np.ndarray, "count d"]:
     """Return `count` points equally spaced in ground-plane arc length, both ends included.
 
     At a repeated position the segment after the last repeated vertex counts; a line of length zero gives its
@@ -33,7 +32,7 @@ def resample(points: Float[AnyArray, "n d"], count: int) -> Float[np.ndarray, "c
 
 
 def sample_at(
-    points: Float[AnyArray, "n d"], distances: Float[AnyArray, " k"], along: Float[np.ndarray, " n"] | None = None
+    points: Float[np.ndarray, "n d"], distances: Float[np.ndarray, " k"], along: Float[np.ndarray, " n"] | None = None
 ) -> Float[np.ndarray, "k d"]:
     """Return the points at the given ground-plane distances along the line, clamped to its ends.
 
@@ -58,7 +57,7 @@ def sample_at(
     return np.where(weight == 1.0, points[segment + 1], out)
 
 
-def resample_lines(lines: Sequence[Float[AnyArray, "_ d"]], count: int) -> Float[np.ndarray, "l count d"]:
+def resample_lines(lines: Sequence[Float[np.ndarray, "_ d"]], count: int) -> Float[np.ndarray, "l count d"]:
     """Return `resample` of every line at once (count >= 2); no line may be empty."""
     if not lines:
         return np.zeros((0, count, 3))
@@ -86,7 +85,7 @@ def resample_lines(lines: Sequence[Float[AnyArray, "_ d"]], count: int) -> Float
 
 
 def pad_lines(
-    lines: Sequence[Float[AnyArray, "_ d"]] | Float[AnyArray, "l n d"], dims: int = 3
+    lines: Sequence[Float[np.ndarray, "_ d"]] | Float[np.ndarray, "l n d"], dims: int = 3
 ) -> Float[np.ndarray, "l n d"]:
     """Stack ragged polylines into one float64 array by repeating each line's last vertex (numpy).
 
@@ -106,7 +105,7 @@ def pad_lines(
 
 
 def segment_distances(
-    points: Float[AnyArray, "*b 2"], start: Float[AnyArray, "m 2"], step: Float[AnyArray, "m 2"]
+    points: Float[np.ndarray, "*b 2"], start: Float[np.ndarray, "m 2"], step: Float[np.ndarray, "m 2"]
 ) -> tuple[Float[np.ndarray, "*b m"], Float[np.ndarray, "*b m"]]:
     """Return where on each straight piece `start` to `start + step` each point is nearest, and the distances.
 
@@ -118,7 +117,7 @@ def segment_distances(
     return t, np.linalg.norm(start + t[..., None] * step - points[..., None, :], axis=-1)
 
 
-def nearest_on(line: Float[AnyArray, "n d"], place: Float[AnyArray, "2"]) -> tuple[int, float, float]:
+def nearest_on(line: Float[np.ndarray, "n d"], place: Float[np.ndarray, "2"]) -> tuple[int, float, float]:
     """Return where a line passes nearest to a place, in the ground plane.
 
     Returns the number of the segment, the fraction of it, and the distance in metres. A line may be a single point.
@@ -131,7 +130,9 @@ def nearest_on(line: Float[AnyArray, "n d"], place: Float[AnyArray, "2"]) -> tup
 
 
 def nearest_lines(
-    lines: Sequence[Float[AnyArray, "_ d"]], count: int, place: Float[AnyArray, "2"] | tuple[float, float] = (0.0, 0.0)
+    lines: Sequence[Float[np.ndarray, "_ d"]],
+    count: int,
+    place: Float[np.ndarray, "2"] | tuple[float, float] = (0.0, 0.0),
 ) -> Int[np.ndarray, " k"]:
     """Return the numbers, ascending, of the `count` lines that pass nearest to a place in the ground plane.
 
@@ -141,7 +142,7 @@ def nearest_lines(
     return np.sort(np.argsort(distance, kind="stable")[:count])
 
 
-def clip_to_range(points: Float[AnyArray, "n d"], range_: PerceptionRange) -> list[np.ndarray]:
+def clip_to_range(points: Float[np.ndarray, "n d"], range_: PerceptionRange) -> list[np.ndarray]:
     """Cut a polyline at the border of the range in x and y.
 
     Returns the pieces inside, in order along the line, with new points exactly on the border (z

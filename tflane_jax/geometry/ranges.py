@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from jaxtyping import Bool, Float
 
-from tflane_jax.geometry.namespace import ArrayT, namespace
+from tflane_jax.geometry.namespace import ArrayT, constants
 from tflane_jax.limits import Count, Interval
 
 
@@ -81,5 +81,4 @@ class BevGrid:
 
 def _like(points: Float[ArrayT, "*b d"], values: tuple[float, ...]) -> Float[ArrayT, "*#b d"]:
     # Of the rank of `points`: the tests run with jax_numpy_rank_promotion="raise".
-    xp = namespace(points)
-    return xp.asarray(values, points.dtype).reshape((1,) * (points.ndim - 1) + (len(values),))
+    return constants(values, points).reshape((1,) * (points.ndim - 1) + (len(values),))

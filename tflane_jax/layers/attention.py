@@ -34,6 +34,9 @@ def masked_attention(
     Args:
         query, key, value: heads first.
         mask: true where a query may attend to a key; None allows all. Rank 2 holds for all heads.
+
+    Raises:
+        TypeError: the mask is not bool.
     """
     heads, queries, keys = *query.shape[:2], key.shape[1]
     if queries == 0 or keys == 0:
@@ -64,7 +67,14 @@ def attention_probabilities(
 
 
 def _per_head(mask: Mask | None) -> Bool[Array, "#h #q #k"] | None:
+    _check_dtype(mask)
     return mask[None] if mask is not None and mask.ndim == 2 else mask
+
+
+def _check_dtype(mask: Mask | None) -> None:
+    # An additive mask (0 and -inf), read as true and false, would allow what it forbids.
+    if mask is not None and mask.dtype != bool:
+        raise TypeError(f"mask is {mask.dtype}: it must be bool, true where a query may attend")
 
 
 def _softmax_dtype(x):
@@ -236,10 +246,11 @@ class MultiHeadAttention(nn.Module):
         """Return the attended values, without residual; 0 for a query that may see no key.
 
         Stores the attention weights as the intermediate `probabilities` (heads, q, k) where a caller asks for it:
-        `module.apply(variables, ..., mutable="intermediates")`.
+        `module.apply(variables, ..., mutable="intermediates")`. Raises TypeError for a mask that is not bool.
         """
         if self.dim % self.heads:
             raise ValueError(f"dim {self.dim} does not split over {self.heads} heads")
+        _check_dtype(mask)
         if mask is not None:
             pairs = mask.any(0) if mask.ndim == 3 else mask
             seen, sees = pairs.any(0)[:, None], pairs.any(1)[:, None]

@@ -76,7 +76,7 @@ class ResNet(nn.Module):
     @nn.compact
     def __call__(
         self, images: Float[Array, "v h w c"], *, train: bool, valid: Bool[Array, " v"] | None = None
-    ) -> list[Float[Array, "v hs ws cs"]]:
+    ) -> list[Float[Array, "v _hs _ws _cs"]]:
         """Return the feature maps of the stages, finest first; the stem alone reduces height and width by 4.
 
         Args:

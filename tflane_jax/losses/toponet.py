@@ -143,10 +143,12 @@ def lane_graph_loss(
         the mean numbers of matched lanes and elements per example.
 
     Raises:
-        ValueError: the prediction has no centerlines, or elements without ground truth.
+        ValueError: the prediction has no centerlines, or elements without ground truth; this is not a batch.
     """
     if prediction.centerlines is None:
         raise ValueError("a lane-graph loss needs predicted centerlines")
+    if lanes.valid.ndim != 2:
+        raise ValueError(f"expected a batch (lanes.valid of shape (batch, n)), but it is of shape {lanes.valid.shape}")
     # Padding may hold NaN; clear it, so that 0 * padding is 0.
     lanes = lanes.replace(points=jnp.where(lanes.valid[..., None, None], lanes.points, 0.0))  # pyright: ignore
     cost = jax.vmap(lambda p, g: matching_cost(p, g, config, control_points))(prediction.centerlines, lanes)

@@ -65,7 +65,7 @@ class BevFormerDetrConfig(HostConfig):
 
     def build(self) -> BevFormerDetr:
         """Return the Linen module; raises UserError where its parts do not fit together."""
-        check_settings(self, "task.model.")
+        check_settings(self)
         return BevFormerDetr(self)
 
     def limits(self) -> Rules:

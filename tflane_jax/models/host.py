@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
 import flax.linen as nn
+import numpy as np
 from flax import struct
 from jaxtyping import Array, Float
 
@@ -48,7 +49,7 @@ class HostConfig:
         priors: traffic flow, SD map, markers; none of them gives the vision-only baseline.
         elements: decoder of traffic elements, which needs cameras; None: no traffic elements.
         initial: kernels of the decoders' transformer layers at the start of training: "lecun" (normal), or "xavier"
-            (uniform), as in the published code.
+            (uniform), as in the published code. Only `init` of the host itself applies it, see `Host.init`.
     """
 
     encoder: EncoderConfig = EvidenceEncoderConfig()
@@ -138,7 +139,11 @@ class Host(nn.Module):
 
     @nn.nowrap
     def init(self, rngs: Any, *args: Any, **kwargs: Any) -> Any:
-        """Return initial variables, as Linen does."""
+        """Return initial variables, as Linen does, with the kernels that `HostConfig.initial` names.
+
+        Only `init` of the host itself does this. In another module, apply `with_xavier_layers` (and `with_equal_heads`)
+        to the host's part of the variables.
+        """
         variables = super().init(rngs, *args, **kwargs)
         if self.config.initial == "lecun":
             return variables
@@ -169,8 +174,12 @@ class Host(nn.Module):
             train: dropout is on, which needs the random key `dropout`; norms use batch statistics.
 
         Raises:
+            ValueError: this is a batch, not one example.
             UserError: the example lacks an input of the model.
         """
+        if (shape := np.shape(example.previous_from_ego)) != (4, 4):
+            wanted = f"expected one example (previous_from_ego of shape (4, 4)), but it is of shape {shape}"
+            raise ValueError(f"{wanted}; jax.vmap adds batches")
         memory = memory or HostMemory()
         observations, memories = observe(self.priors.by_name, example, memory.priors)
         answer, bev = self.answer(example, memory.bev, observations, train=train)

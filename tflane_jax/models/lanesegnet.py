@@ -104,7 +104,7 @@ class LaneSegNetConfig(HostConfig):
 
     def build(self) -> LaneSegNet:
         """Return the Linen module; raises UserError where its parts do not fit together."""
-        check_settings(self, "task.model.")
+        check_settings(self)
         return LaneSegNet(self)
 
     def limits(self) -> Rules:

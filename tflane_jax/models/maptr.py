@@ -124,7 +124,7 @@ class MapTrConfig(HostConfig):
 
     def build(self) -> Host:
         """Return the Linen module; raises UserError where its parts do not fit together."""
-        check_settings(self, "task.model.")
+        check_settings(self)
         return MapTr(self)
 
     def limits(self) -> Rules:

@@ -68,7 +68,7 @@ class MapTrV2Config(MapTrConfig):
 
     def build(self) -> Host:
         """Return the Linen module; raises UserError where its parts do not fit together."""
-        check_settings(self, "task.model.")
+        check_settings(self)
         return MapTrV2(self)
 
     def limits(self) -> Rules:

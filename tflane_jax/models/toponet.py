@@ -69,7 +69,7 @@ class TopoNetConfig(HostConfig):
 
     def build(self) -> TopoNet:
         """Return the Linen module; raises UserError where encoder, decoder and elements do not fit together."""
-        check_settings(self, "task.model.")
+        check_settings(self)
         return TopoNet(self)
 
     def limits(self) -> Rules:

@@ -110,7 +110,7 @@ class TrafficFlowConfig:
 
     def build(self, host: HostSpec) -> TrafficFlowPrior:
         """Return the prior for a host; raises UserError for settings that break a limit."""
-        check_settings(self, "task.model.priors.traffic_flow.")
+        check_settings(self)
         return TrafficFlowPrior(self, host)
 
 
@@ -137,8 +137,10 @@ class TrafficFlowPrior(Prior):
     def __init__(self, config: TrafficFlowConfig, host: HostSpec):
         self.config, self.host = config, host
         coordinates = config.prior.coordinates
-        encoder = None if config.insert == "nowhere" else TemporalEncoder(config.module, host.dim, coordinates)
-        self.temporal_encoder = encoder
+        self.temporal_encoder = None
+        if config.insert != "nowhere":
+            # Named as in a host, so that a module of one's own can take the parameters of a trained host.
+            self.temporal_encoder = TemporalEncoder(config.module, host.dim, coordinates, name="temporal_encoder")
 
     def modules(self) -> dict[str, nn.Module]:
         """Return the temporal encoder."""

@@ -11,11 +11,12 @@ from typing import Annotated, Literal
 
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 
 from tflane_jax.geometry.namespace import namespace
 from tflane_jax.limits import Count, Positive, at_least
 from tflane_jax.scene import MarkerObservations
+from tflane_jax.scene.arrays import Array
 
 
 @dataclass(frozen=True)

@@ -8,12 +8,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from flax import struct
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.geometry.namespace import namespace
 from tflane_jax.limits import Count
 from tflane_jax.scene import SdCategory, SdMap
+from tflane_jax.scene.arrays import Array
 
 
 @dataclass(frozen=True)

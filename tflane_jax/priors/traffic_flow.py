@@ -12,12 +12,13 @@ from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from flax import struct
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.geometry.namespace import namespace
 from tflane_jax.limits import Count, CountOrZero, Positive, Rules, within
 from tflane_jax.scene import TrafficFlow
+from tflane_jax.scene.arrays import Array
 
 
 @dataclass(frozen=True)

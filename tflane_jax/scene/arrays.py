@@ -1,14 +1,57 @@
-"""The array type of the containers: numpy on the host, JAX on the device."""
+"""The array type of the containers, numpy on the host and JAX on the device, and the check of their shapes."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import dataclasses
+import functools
+import typing
+from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
 
 # A union would make pyright reject operations that only one of the two types allows.
 if TYPE_CHECKING:
-    from typing import Any as Array
+    Array = Any
 else:
     Array = np.ndarray | jax.Array
+
+
+def check_shapes(container: Any) -> None:
+    """Check the fields of a container against the shapes in their annotations, and validate the containers in it.
+
+    A letter stands for one length in all fields of a container. A field that may be None is checked if it is not.
+    Raises AssertionError naming the first field that does not fit those before it.
+    """
+    lengths: dict[str, int] = {}
+    for name, (axes, optional) in _fields(type(container)).items():
+        value = getattr(container, name)
+        if value is None and optional:
+            continue
+        if value is None:
+            raise AssertionError(f"{name} is None")
+        if axes is None:
+            try:
+                value.validate()
+            except AssertionError as error:
+                raise AssertionError(f"{name}.{error}") from None
+            continue
+        found = np.shape(value)
+        fits = len(found) == len(axes) and all(
+            length == (int(axis) if axis.isdigit() else lengths.setdefault(axis, length))
+            for axis, length in zip(axes, found, strict=True)
+        )
+        if not fits:
+            wanted = ", ".join(str(lengths.get(axis, axis)) for axis in axes) + "," * (len(axes) == 1)
+            raise AssertionError(f"{name} is of shape {found}, expected ({wanted})")
+
+
+@functools.cache
+def _fields(kind: type) -> dict[str, tuple[list[str] | None, bool]]:
+    """Return for each field its axes, None for a container, and whether it may be None."""
+    hints, fields = typing.get_type_hints(kind), {}
+    for field in dataclasses.fields(kind):
+        members = typing.get_args(hints[field.name]) or (hints[field.name],)
+        axes = [member.dim_str.split() for member in members if hasattr(member, "dim_str")]
+        fields[field.name] = axes[0] if axes else None, type(None) in members
+    return fields

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from typing import Any, TypeVar
 
-import chex
 import jax
 import numpy as np
 from flax import struct
 from jaxtyping import Bool, Float, UInt8
 
-from tflane_jax.scene.arrays import Array
+from tflane_jax.scene.arrays import Array, check_shapes
 from tflane_jax.scene.priors import MarkerObservations, SdMap, TrafficFlow
 from tflane_jax.scene.truth import Areas, LaneGraph, LaneLines, MapLines, TrafficElements
 from tflane_jax.scene.views import CameraViews
@@ -57,22 +56,15 @@ class Example:
     map_lines: MapLines | None = None
 
     def validate(self) -> None:
-        """Validate every part; raise AssertionError naming the first field that does not fit."""
-        parts = (
-            self.traffic_flow,
-            self.markers,
-            self.sd_map,
-            self.lanes,
-            self.segments,
-            self.areas,
-            self.traffic_elements,
-            self.cameras,
-            self.map_lines,
-        )
-        for part in parts:
-            if part is not None:
-                part.validate()
-        chex.assert_shape(self.previous_from_ego, (4, 4))
+        """Raise AssertionError naming the first field whose shape does not fit."""
+        check_shapes(self)
+        if self.traffic_elements is not None:
+            rows, lanes, segments = (
+                len(each) for each in (self.traffic_elements.lane, self.lanes.valid, self.segments.valid)
+            )
+            if rows not in (lanes, segments):
+                expected = f"one for each of {lanes} lanes, or of {segments} segments"
+                raise AssertionError(f"traffic_elements.lane has {rows} rows, expected {expected}")
 
 
 @struct.dataclass
@@ -90,10 +82,8 @@ class RoadImage:
     lines: LaneLines
 
     def validate(self) -> None:
-        """Validate every part; raise AssertionError naming the first field that does not fit."""
-        h, w = self.image_valid.shape
-        chex.assert_shape(self.image, (h, w, 3))
-        self.lines.validate()
+        """Raise AssertionError naming the first field whose shape does not fit."""
+        check_shapes(self)
 
 
 def stack_examples(examples: list[Any]) -> Any:

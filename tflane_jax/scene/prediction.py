@@ -44,6 +44,11 @@ class AreaPrediction:
     points: Float[Array, "*layers q p 3"]
     logits: Float[Array, "*layers q 2"]
 
+    @property
+    def scores(self) -> Float[Array, "*layers q"]:
+        """Confidence of the best class, 0 to 1."""
+        return jax.nn.sigmoid(self.logits).max(-1)
+
 
 @struct.dataclass
 class SegmentPrediction:
@@ -107,6 +112,11 @@ class ElementPrediction:
     logits: Float[Array, "*layers e a"]
     lane_logits: Float[Array, "*layers q e"] | None = None
 
+    @property
+    def scores(self) -> Float[Array, "*layers e"]:
+        """Confidence of the best attribute, 0 to 1."""
+        return jax.nn.sigmoid(self.logits).max(-1)
+
 
 @struct.dataclass
 class CurvePrediction:
@@ -120,6 +130,11 @@ class CurvePrediction:
 
     logits: Float[Array, "*layers q 2"]
     curves: Float[Array, "*layers q 8"]
+
+    @property
+    def scores(self) -> Float[Array, "*layers q"]:
+        """Probability that the query is a lane, 0 to 1."""
+        return jax.nn.softmax(self.logits)[..., 1]
 
 
 @struct.dataclass

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import enum
 
-import chex
 import numpy as np
 from flax import struct
 from jaxtyping import Bool, Float, Int
 
-from tflane_jax.scene.arrays import Array
+from tflane_jax.scene.arrays import Array, check_shapes
 
 
 class RoadUser(enum.IntEnum):
@@ -73,12 +72,8 @@ class TrafficFlow:
         )
 
     def validate(self) -> None:
-        """Raise AssertionError naming the field whose shape does not fit the others."""
-        k, n = self.valid.shape
-        chex.assert_shape(self.position, (k, n, 3))
-        chex.assert_shape([self.yaw, self.occluded, self.valid], (k, n))
-        chex.assert_shape(self.size, (k, 3))
-        chex.assert_shape(self.category, (k,))
+        """Raise AssertionError naming the first field whose shape does not fit."""
+        check_shapes(self)
 
 
 @struct.dataclass
@@ -120,13 +115,8 @@ class MarkerObservations:
         )
 
     def validate(self) -> None:
-        """Raise AssertionError naming the field whose shape does not fit the others."""
-        m, j, p = self.lanes.shape[:3]
-        chex.assert_shape(self.lanes, (m, j, p, 3))
-        chex.assert_shape(self.pose, (m, 4, 4))
-        chex.assert_shape([self.marker_id, self.score, self.residual, self.valid], (m,))
-        chex.assert_shape(self.lane_valid, (m, j))
-        chex.assert_shape(self.successor, (m, j, j))
+        """Raise AssertionError naming the first field whose shape does not fit."""
+        check_shapes(self)
 
 
 @struct.dataclass
@@ -149,7 +139,5 @@ class SdMap:
         return cls(np.zeros((capacity, points, 2), np.float32), np.zeros(capacity, np.int32), np.zeros(capacity, bool))
 
     def validate(self) -> None:
-        """Raise AssertionError naming the field whose shape does not fit the others."""
-        r, p = self.points.shape[:2]
-        chex.assert_shape(self.points, (r, p, 2))
-        chex.assert_shape([self.category, self.valid], (r,))
+        """Raise AssertionError naming the first field whose shape does not fit."""
+        check_shapes(self)

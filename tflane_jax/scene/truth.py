@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import enum
 
-import chex
 import numpy as np
 from flax import struct
 from jaxtyping import Bool, Float, Int
 
-from tflane_jax.scene.arrays import Array
+from tflane_jax.scene.arrays import Array, check_shapes
 
 
 class LineType(enum.IntEnum):
@@ -81,12 +80,8 @@ class LaneGraph:
         )
 
     def validate(self) -> None:
-        """Raise AssertionError naming the field whose shape does not fit the others."""
-        n, p = self.points.shape[:2]
-        chex.assert_shape([self.points, self.left, self.right], (n, p, 3))
-        chex.assert_shape([self.left_type, self.right_type, self.is_connector, self.visibility], (n,))
-        chex.assert_shape(self.successor, (n, n))
-        chex.assert_shape(self.valid, (n,))
+        """Raise AssertionError naming the first field whose shape does not fit."""
+        check_shapes(self)
 
 
 @struct.dataclass
@@ -109,10 +104,8 @@ class Areas:
         return cls(np.zeros((capacity, points, 3), np.float32), np.zeros(capacity, np.int32), np.zeros(capacity, bool))
 
     def validate(self) -> None:
-        """Raise AssertionError naming the field whose shape does not fit the others."""
-        a, p = self.points.shape[:2]
-        chex.assert_shape(self.points, (a, p, 3))
-        chex.assert_shape([self.category, self.valid], (a,))
+        """Raise AssertionError naming the first field whose shape does not fit."""
+        check_shapes(self)
 
 
 @struct.dataclass
@@ -155,15 +148,8 @@ class MapLines:
         )
 
     def validate(self) -> None:
-        """Raise AssertionError naming the field whose shape does not fit the others."""
-        l, p = self.points.shape[:2]
-        chex.assert_shape(self.points, (l, p, 3))
-        chex.assert_shape([self.category, self.closed, self.valid], (l,))
-        for known in (self.visibility, self.identity):
-            if known is not None:
-                chex.assert_shape(known, (l,))
-        if self.dense is not None:
-            chex.assert_shape(self.dense, (l, None, 3))
+        """Raise AssertionError naming the first field whose shape does not fit."""
+        check_shapes(self)
 
 
 @struct.dataclass
@@ -200,12 +186,8 @@ class TrafficElements:
         )
 
     def validate(self) -> None:
-        """Raise AssertionError naming the field whose shape does not fit the others."""
-        e = self.valid.shape[0]
-        chex.assert_shape(self.position, (e, 3))
-        chex.assert_shape(self.box, (e, 2, 2))
-        chex.assert_shape([self.category, self.attribute, self.valid], (e,))
-        chex.assert_shape(self.lane, (None, e))
+        """Raise AssertionError naming the first field whose shape does not fit."""
+        check_shapes(self)
 
 
 @struct.dataclass
@@ -230,8 +212,5 @@ class LaneLines:
         )
 
     def validate(self) -> None:
-        """Raise AssertionError naming the field whose shape does not fit the others."""
-        l, p = self.points.shape[:2]
-        chex.assert_shape(self.points, (l, p, 2))
-        chex.assert_shape(self.point_valid, (l, p))
-        chex.assert_shape(self.valid, (l,))
+        """Raise AssertionError naming the first field whose shape does not fit."""
+        check_shapes(self)

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import enum
 
-import chex
 from flax import struct
 from jaxtyping import Bool, Float, Int, UInt8
 
-from tflane_jax.scene.arrays import Array
+from tflane_jax.scene.arrays import Array, check_shapes
 
 
 class BevChannel(enum.IntEnum):
@@ -37,6 +36,10 @@ class VehicleState:
     vehicle_from_ego: Float[Array, "4 4"]
     can_bus: Float[Array, "18"] | None = None
 
+    def validate(self) -> None:
+        """Raise AssertionError naming the first field whose shape does not fit."""
+        check_shapes(self)
+
 
 @struct.dataclass
 class CameraViews:
@@ -51,9 +54,9 @@ class CameraViews:
         intrinsics: (V, 3, 3), pixels from the top-left corner of the image (see `geometry.cameras`).
         camera_from_ego: (V, 4, 4) extrinsics, metres.
         valid: (V,) the camera delivered an image.
-        depth: (V, h, w) depth of the nearest surface in square cells of the image array, metres along the optical axis;
-            only for training. None if it is not known.
-        depth_valid: (V, h, w) a surface was measured in the cell.
+        depth: (V, rows, columns) depth of the nearest surface in square cells of the image array, metres along the
+            optical axis; only for training. None if it is not known.
+        depth_valid: (V, rows, columns) a surface was measured in the cell.
         vehicle: frames and bus signals that published weights need; None if the data have none.
     """
 
@@ -62,22 +65,12 @@ class CameraViews:
     intrinsics: Float[Array, "v 3 3"]
     camera_from_ego: Float[Array, "v 4 4"]
     valid: Bool[Array, " v"]
-    depth: Float[Array, "v h w"] | None = None
-    depth_valid: Bool[Array, "v h w"] | None = None
+    depth: Float[Array, "v rows columns"] | None = None
+    depth_valid: Bool[Array, "v rows columns"] | None = None
     vehicle: VehicleState | None = None
 
     def validate(self) -> None:
-        """Raise AssertionError naming the field whose shape does not fit the others."""
-        v, h, w = self.image.shape[:3]
-        chex.assert_shape(self.image, (v, h, w, 3))
-        chex.assert_shape(self.size, (v, 2))
-        chex.assert_shape(self.intrinsics, (v, 3, 3))
-        chex.assert_shape(self.camera_from_ego, (v, 4, 4))
-        chex.assert_shape(self.valid, (v,))
-        if self.depth is not None:
-            chex.assert_shape(self.depth, (v, None, None))
-            chex.assert_equal_shape([self.depth, self.depth_valid])
-        if self.vehicle is not None:
-            chex.assert_shape([self.vehicle.lidar_from_ego, self.vehicle.vehicle_from_ego], (4, 4))
-            if self.vehicle.can_bus is not None:
-                chex.assert_shape(self.vehicle.can_bus, (18,))
+        """Raise AssertionError naming the first field whose shape does not fit."""
+        check_shapes(self)
+        if (self.depth is None) != (self.depth_valid is None):
+            raise AssertionError("depth and depth_valid go together, and one of them is None")

@@ -31,7 +31,7 @@ SourceT = TypeVar("SourceT")
 MemoryT = TypeVar("MemoryT")
 """Type of what a model carries from frame to frame; None for a model without memory."""
 
-Terms = dict[str, Float[Array, ""] | Params]
+Recorded = dict[str, Float[Array, ""] | Params]
 """Numbers to record beside a loss; the entry `STATISTICS` holds the new running statistics."""
 Draw = Callable[[Path, int, Params], None]
 """(run folder, step, averaged parameters) -> None; writes pictures to the run folder."""
@@ -88,7 +88,7 @@ class Task(Generic[ExampleT, DataT, SourceT, MemoryT]):
         """Return initial parameters; only the shapes of `example` are used."""
         raise NotImplementedError
 
-    def loss(self, params: Params, batch: ExampleT, key: jax.Array) -> tuple[Float[Array, ""], Terms]:
+    def loss(self, params: Params, batch: ExampleT, key: jax.Array) -> tuple[Float[Array, ""], Recorded]:
         """Return the loss of a batch (leading axis on every leaf) and the numbers to record; `key` is for dropout."""
         raise NotImplementedError
 

@@ -37,7 +37,7 @@ from tflane_jax.models.priors import ByPrior, observe, observe_clip
 from tflane_jax.models.toponet import TopoNetConfig
 from tflane_jax.scene import Example, Prediction, shapes_of, stack_examples
 from tflane_jax.tasks import score_names
-from tflane_jax.tasks.base import Draw, Model, Task, Terms, spread
+from tflane_jax.tasks.base import Draw, Model, Recorded, Task, spread
 from tflane_jax.tasks.fit import check_fit, check_settings_fit, frozen_modules, reads_traffic
 from tflane_jax.tasks.lane_pictures import draw_differences, draw_examples, draw_hidden_lanes
 
@@ -99,8 +99,15 @@ class LaneGraphTask(Task[Example, Example | Streamed, LaneGraphSource, HostMemor
             example = jax.tree.map(lambda leaf: leaf[0], example)
         return joined_statistics(self.model.build().init(key, example))
 
-    def loss(self, params: Params, batch: Example, key: jax.Array) -> tuple[Float[Array, ""], Terms]:
-        """Return the loss of a batch (leading axis on every leaf) and its terms; `key` is for dropout."""
+    def loss(self, params: Params, batch: Example, key: jax.Array) -> tuple[Float[Array, ""], Recorded]:
+        """Return the loss of a batch (leading axis on every leaf) and its terms; `key` is for dropout.
+
+        Raises ValueError for anything but a batch.
+        """
+        wanted = ("batch", 4, 4) if self.clip == 1 else ("batch", self.clip, 4, 4)
+        if len(shape := np.shape(batch.previous_from_ego)) != len(wanted):
+            sizes = ", ".join(map(str, wanted))
+            raise ValueError(f"expected a batch (previous_from_ego of shape ({sizes})), but it is of shape {shape}")
         learned, statistics = split_statistics(params)
         module, start = self.model.build(), self.start()
         observations = jax.vmap(self._observations)(batch)

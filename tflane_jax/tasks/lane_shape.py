@@ -46,7 +46,7 @@ from tflane_jax.models.lstr import LstrConfig, normalise
 from tflane_jax.models.lstr_init import lstr_init
 from tflane_jax.models.parameters import Params, joined_statistics, split_statistics
 from tflane_jax.scene import CurvePrediction, LaneLines, Prediction, RoadImage, shapes_of, stack_examples
-from tflane_jax.tasks.base import Draw, Model, Task, Terms, spread
+from tflane_jax.tasks.base import Draw, Model, Recorded, Task, spread
 from tflane_jax.tasks.edge_types import save_edge_types
 from tflane_jax.world.front_view.lines import CAPACITY, ROWS
 
@@ -87,8 +87,13 @@ class LaneShapeTask(Task[RoadImage, LabelledImages, ImageSource, None]):
         params = joined_statistics(self.model.build().init(key, image, example.image_valid))
         return lstr_init(params, key) if self.model.init == "lstr" else params
 
-    def loss(self, params: Params, batch: RoadImage, key: jax.Array) -> tuple[Float[Array, ""], Terms]:
-        """Return the loss of a batch (leading axis on every leaf) and its terms; norms use batch statistics."""
+    def loss(self, params: Params, batch: RoadImage, key: jax.Array) -> tuple[Float[Array, ""], Recorded]:
+        """Return the loss of a batch (leading axis on every leaf) and its terms; norms use batch statistics.
+
+        Raises ValueError for anything but a batch.
+        """
+        if len(shape := np.shape(batch.image)) != 4:
+            raise ValueError(f"expected a batch (image of shape (batch, h, w, 3)), but it is of shape {shape}")
         learned, statistics = split_statistics(params)
         module, keys = self.model.build(), jax.random.split(key, len(batch.image))
 
@@ -222,7 +227,7 @@ def found_lanes(prediction: CurvePrediction, truth: RowLanes, threshold: float |
     """Return the lanes of one prediction at the rows of the truth; `threshold` as of `lane_shapes.detected`."""
     assert truth.rows is not None, "labels have rows"
     height, width = truth.size
-    return lane_shapes.row_lanes(prediction, truth.rows, height=height, width=width, threshold=threshold)
+    return lane_shapes.detections_of_curves(prediction, truth.rows, height=height, width=width, threshold=threshold)
 
 
 def predict_curves(

@@ -15,7 +15,6 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from tflane_jax.datasets.photos import FOCAL, HORIZON, PhotoCamera, Placement, fit_photo
-from tflane_jax.evaluation.lane_shapes import lane_scores
 from tflane_jax.evaluation.photo_lanes import Judgement, common_horizon, is_blank, judge_lanes, without_crossings
 from tflane_jax.evaluation.predict import Predictor
 from tflane_jax.files.images import opencv
@@ -156,7 +155,7 @@ class PhotoReader:
         example = RoadImage(fitted.image, fitted.image_valid, LaneLines.empty(1, 1))
         stacked = jax.tree.map(lambda leaf: np.asarray(leaf)[None], example)
         answer = row_of(predict_curves(self.task, self.params, stacked), 0)
-        scores = lane_scores(answer)
+        scores = np.asarray(answer.scores)
         curves = np.asarray(answer.curves, np.float64)
         # A lane that would end above its beginning has no points, as in TuSimple's metric.
         chosen = np.flatnonzero((scores >= self.threshold) & (curves[:, 1] > curves[:, 0]))

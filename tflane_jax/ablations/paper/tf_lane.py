@@ -222,6 +222,7 @@ TABLES = (
                 "abla5": ("LT/LL", "1", "T", *_BEST),
             },
         ),
+        minutes=7.0,
     ),
     _on_lanesegnet(
         6,

@@ -1,6 +1,5 @@
 """The command line: train, resume, evaluate and predict on fake examples, and error messages."""
 
-import errno
 import json
 import os
 import re
@@ -274,16 +273,6 @@ def test_errors_are_one_line_without_a_traceback(arguments, message, config, tra
     assert said.startswith("tflane: ")
     assert said.count("\n") == 1
     assert os.listdir(tmp_path) == []
-
-
-def test_a_folder_that_may_not_be_read_is_one_line(monkeypatch, capsys):
-    def forbidden(*_):
-        raise PermissionError(errno.EACCES, "Permission denied", "/private/runs")
-
-    monkeypatch.setattr("tflane_jax.commands.cache.show", forbidden)
-    assert main(["cache", "list"]) == 2
-    said = capsys.readouterr().err
-    assert said == "tflane: /private/runs: Permission denied: give yourself the right, or choose another path\n"
 
 
 @pytest.mark.parametrize(

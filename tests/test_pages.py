@@ -10,9 +10,9 @@ from typing import Any
 import jax
 import pytest
 
-from tests.models.images import road_image, tiny_task
 from tests.models.toy_host import ToyHostConfig, ToyHostLossConfig
 from tests.shared import ROOT
+from tests.training.stub import LineDataset, LineTask, line_arrays
 from tflane_jax.cli import build_parser
 from tflane_jax.config import RunConfig, load_config
 from tflane_jax.config_overrides import apply_overrides
@@ -122,29 +122,17 @@ def test_links_lead_to_headings():
             assert anchor in anchors(target.read_text("utf-8")), f"{page} links to {path}#{anchor}"
 
 
-def test_the_training_loop_of_the_page_trains(monkeypatch, capsys):
-    """It runs with a small model with batch norms, on images of noise."""
+def test_the_training_loop_of_the_page_trains(monkeypatch):
+    """It runs with a small task that has running statistics."""
     blocks = re.findall(r"^```python\n(.*?)^```", PAGES["docs/predictions.md"], re.DOTALL | re.MULTILINE)
     (code,) = [block for block in blocks if "optimizer" in block]
-    data = SimpleNamespace(source=lambda split: split)
-    config = SimpleNamespace(task=tiny_task(), data=data)
+    task = LineTask()
+    config = SimpleNamespace(task=task, data=SimpleNamespace(source=lambda split: split))
     monkeypatch.setattr("tflane_jax.config.load_config", lambda name: config)
-    monkeypatch.setattr(sources, "open_dataset", lambda split: Images())
+    monkeypatch.setattr(sources, "open_dataset", lambda split: LineDataset())
     names: dict[str, Any] = {}
     exec(compile(code, "predictions.md", "exec"), names)
-    first, *_, last = [float(line.split()[1]) for line in capsys.readouterr().out.splitlines()]
-    assert last < first
-    start = config.task.init(jax.random.key(0), road_image(0))
-    moved = jax.tree.map(lambda a, b: bool((a != b).any()), start, names["params"])
-    assert any(jax.tree.leaves(moved.pop(STATISTICS)))
-    assert any(jax.tree.leaves(moved))
-
-
-class Images:
-    """A dataset of two images."""
-
-    def __len__(self):
-        return 2
-
-    def example(self, index):
-        return road_image(index)
+    start, end = task.init(jax.random.key(0), LineDataset().example(0)), names["params"]
+    before, after = (float(task.loss(params, line_arrays(), jax.random.key(0))[0]) for params in (start, end))
+    assert after < before
+    assert (end[STATISTICS]["mean"] != start[STATISTICS]["mean"]).all()

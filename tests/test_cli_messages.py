@@ -1,6 +1,8 @@
-"""Warnings of the command line."""
+"""Warnings of the command line, and what the system refuses it."""
 
-from tflane_jax.cli import OneLineWarnings
+import errno
+
+from tflane_jax.cli import OneLineWarnings, main
 from tflane_jax.datasets.base import TruncationWarning
 
 
@@ -12,3 +14,13 @@ def test_warnings_are_one_line_each_and_told_once(capsys):
     show(UserWarning("of another package"), UserWarning, "file.py", 7)
     assert capsys.readouterr().err == "tflane: warning: more lanes\ntflane: warning: more tracks\n"
     assert others == ["of another package"]
+
+
+def test_a_folder_that_may_not_be_read_is_one_line(monkeypatch, capsys):
+    def forbidden(*_):
+        raise PermissionError(errno.EACCES, "Permission denied", "/private/runs")
+
+    monkeypatch.setattr("tflane_jax.commands.cache.show", forbidden)
+    assert main(["cache", "list"]) == 2
+    said = capsys.readouterr().err
+    assert said == "tflane: /private/runs: Permission denied: give yourself the right, or choose another path\n"

@@ -32,6 +32,7 @@ def test_missing_weights_are_named_before_anything_is_written(name, tmp_path, mo
     assert not (tmp_path / "runs").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.golden
 def test_weights_are_converted_once(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("TFLANE_WEIGHTS", str(shared_path("data/lstr")))

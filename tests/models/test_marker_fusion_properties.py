@@ -117,7 +117,7 @@ MOTION = st.tuples(st.floats(-8, 8), st.floats(-3, 3), st.floats(-0.6, 0.6))
 
 
 @given(st.lists(MOTION, min_size=1, max_size=2), MOTION)
-@settings(max_examples=30)
+@settings(max_examples=15)
 def test_remembered_lanes_stay_on_the_ground_on_any_drive(steps, turn):
     """The bank moves its lanes with each pose; here the poses of the whole drive are known at once."""
     prior = MarkerPrior(CONFIG, HOST)

@@ -59,7 +59,7 @@ def _run_command(options: argparse.Namespace, rest: Sequence[str]) -> int:
         return 128 + signal.SIGPIPE
     except OSError as error:
         # pathlib raises these wherever it looks for such a file
-        if error.errno not in (errno.ENAMETOOLONG, errno.EACCES, errno.EPERM):
+        if error.filename is None or error.errno not in (errno.ENAMETOOLONG, errno.EACCES, errno.EPERM):
             raise
         remedy = "" if error.errno == errno.ENAMETOOLONG else ": give yourself the right, or choose another path"
         print(f"tflane: {error.filename}: {error.strerror}{remedy}", file=sys.stderr)

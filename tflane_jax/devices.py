@@ -1,6 +1,6 @@
-"""Data parallelism: each batch is divided among the devices by examples, and all devices have the parameters.
+"""Data parallelism: each batch is divided among the devices by examples; every device holds the parameters.
 
-Or each has a part of them, see `training.sharding`.
+With `training.shard_state` it holds a part of them (`training.sharding`).
 
 A program stays one program over all devices of all processes (GSPMD): XLA divides the work on single examples, and adds
 up gradients and batch statistics. A loss is therefore that of the whole batch, and equal on one device and on many up

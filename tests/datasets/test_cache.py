@@ -20,6 +20,7 @@ from tests.shared import ROOT
 from tflane_jax.datasets import cache, parallel
 from tflane_jax.datasets.base import TruncationWarning
 from tflane_jax.datasets.cache import CachedDataset, cache_root, cached, fingerprint
+from tflane_jax.datasets.cache_entries import cache_entries, delete_entry
 from tflane_jax.errors import UserError
 
 
@@ -203,6 +204,9 @@ def test_a_file_system_without_locks_is_told_and_used(tmp_path, monkeypatch, cap
     monkeypatch.setattr("fcntl.flock", no_locks)
     build(tmp_path)
     assert "this file system has no locks" in capsys.readouterr().err
+    (entry,) = cache_entries(tmp_path)
+    assert not entry.building
+    delete_entry(entry)
 
 
 def test_a_lock_that_was_deleted_with_its_entry_is_taken_anew(tmp_path, monkeypatch):

@@ -7,13 +7,15 @@
 TopoNet, LaneSegNet and MapTRv2 make updates of one batch of invented numbers in the shapes of their data: a fifth of
 the slots for lanes is valid, images are noise. The time of matching on the device depends on the number of lanes.
 Losses mean nothing. The fraction of the peak is XLA's count of operations before fusion, divided by time and the data
-sheet's peak.
+sheet's peak. Every model has a process of its own: all compile at the same time, and run one after the other.
 """
 
 from __future__ import annotations
 
+import multiprocessing
 import time
 from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -21,7 +23,9 @@ from typing import Any, TypeVar
 import jax
 import numpy as np
 
+from benchmarks.gpu.turns import alone
 from benchmarks.timing import command_line, machine, markdown_table, save
+from tflane_jax import accelerators
 from tflane_jax.config import RunConfig, load_config
 from tflane_jax.layers.precision import Precision
 from tflane_jax.plan import ACCELERATORS
@@ -88,10 +92,11 @@ def measured(config: RunConfig, batch_size: int, updates: int, peak: float) -> d
     update = lowered.compile()
     compile_s, seconds = time.perf_counter() - began, []
     planned = update.memory_analysis()
-    for _ in range(updates):
-        began = time.perf_counter()
-        state, metrics = jax.block_until_ready(update(state, batch))
-        seconds.append(time.perf_counter() - began)
+    with alone():
+        for _ in range(updates):
+            began = time.perf_counter()
+            state, metrics = jax.block_until_ready(update(state, batch))
+            seconds.append(time.perf_counter() - began)
     update_s = float(np.median(seconds[1:]))  # the first touches fresh memory
     used = (jax.devices()[0].memory_stats() or {}).get("peak_bytes_in_use")
     return {
@@ -119,11 +124,13 @@ def run(
 ) -> dict[str, Any]:
     """Measure the models, print the table, and write `gpu_steps.json` and `.md` into `out`."""
     peak = getattr(ACCELERATORS[kind], precision)
-    rows: dict[str, dict[str, Any]] = {}
-    for model in models:
-        config = configuration(model, precision, remat=remat, tiny=tiny)
-        rows[model] = measured(config, batch_size, 3 if tiny else UPDATES, peak)
-        print(model, rows[model], flush=True)
+    accelerators.leave_to_workers()
+    with ProcessPoolExecutor(len(models), multiprocessing.get_context("spawn")) as processes:
+        begun = {}
+        for model in models:
+            config = configuration(model, precision, remat=remat, tiny=tiny)
+            begun[model] = processes.submit(measured, config, batch_size, 3 if tiny else UPDATES, peak)
+        rows = {model: found.result() for model, found in begun.items()}
     settings = {"batch_size": batch_size, "precision": precision, "remat": remat, "kind": kind, "tiny": tiny}
     record = machine() | {"device": jax.devices()[0].device_kind, "settings": settings, "models": rows}
     header = ["model", "compile s", "ms an update", "examples/s", "GFLOP", "of peak", "peak GiB", "planned GiB"]

@@ -6,6 +6,7 @@ each process, however many the job gave it.
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import re
 from collections.abc import Mapping
@@ -14,6 +15,8 @@ from pathlib import Path
 _VISIBLE = "CUDA_VISIBLE_DEVICES"
 _FRACTION = "XLA_PYTHON_CLIENT_MEM_FRACTION"
 _SHARED_FRACTION = 0.9
+_PLUGINS = ("jax_cuda13_plugin", "jax_cuda12_plugin")
+_TRITON = "--xla_gpu_enable_triton_gemm"
 
 
 def devices_of_task(environment: Mapping[str, str]) -> list[int] | None:
@@ -83,3 +86,17 @@ def of_worker(slot: int, parallel: int) -> dict[str, str]:
 def leave_to_workers() -> None:
     """Let this process, and those that it starts to train, reserve no memory of GPUs in advance."""
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
+
+
+def multiply_by_library() -> None:
+    """Let XLA leave products of matrices on GPUs to NVIDIA's library, unless XLA_FLAGS says how they are made.
+
+    XLA's own kernels for them end the process while it compiles, with a failed check in triton_tiling_propagation.cc
+    (openxla/xla issue 47381; seen with jaxlib 0.11.2 on the update of the lane shape models). To be called before JAX
+    looks for its devices. Without a GPU that JAX can use, nothing changes.
+    """
+    if os.environ.get("JAX_PLATFORMS") == "cpu" or not gpus():
+        return
+    flags = os.environ.get("XLA_FLAGS", "")
+    if _TRITON not in flags and any(importlib.util.find_spec(name) for name in _PLUGINS):
+        os.environ["XLA_FLAGS"] = f"{flags} {_TRITON}=false".strip()

@@ -17,6 +17,7 @@ import time
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import fields, is_dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -30,6 +31,7 @@ from tflane_jax.config import RunConfig, load_config
 from tflane_jax.layers.precision import Precision
 from tflane_jax.plan import ACCELERATORS
 from tflane_jax.scene import shapes_of
+from tflane_jax.training.runtime import configure_jax
 from tflane_jax.training.schedule import make_optimizer
 from tflane_jax.training.state import init_states
 from tflane_jax.training.step import make_update_step
@@ -125,7 +127,8 @@ def run(
     """Measure the models, print the table, and write `gpu_steps.json` and `.md` into `out`."""
     peak = getattr(ACCELERATORS[kind], precision)
     accelerators.leave_to_workers()
-    with ProcessPoolExecutor(len(models), multiprocessing.get_context("spawn")) as processes:
+    settings_of_jax = partial(configure_jax, keep_programs=False)  # compiling is timed
+    with ProcessPoolExecutor(len(models), multiprocessing.get_context("spawn"), settings_of_jax) as processes:
         begun = {}
         for model in models:
             config = configuration(model, precision, remat=remat, tiny=tiny)

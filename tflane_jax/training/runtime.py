@@ -11,6 +11,7 @@ from typing import Any
 
 import jax
 
+from tflane_jax import accelerators
 from tflane_jax.datasets.cache import cache_root
 from tflane_jax.errors import UserError
 from tflane_jax.memory import keep_freed_memory
@@ -23,6 +24,8 @@ _PROGRAMS = 2 * 2**30  # bytes of kept programs
 def configure_jax(*, keep_programs: bool = True) -> None:
     """Make silent broadcasting between ranks an error, keep freed memory and compiled programs, trace faster.
 
+    On GPUs, products of matrices are left to NVIDIA's library, see `accelerators.multiply_by_library`.
+
     Args:
         keep_programs: keep compiled programs for the next process, in the folder `programs` of the cache (TFLANE_CACHE)
             or where JAX_COMPILATION_CACHE_DIR says. JAX_ENABLE_COMPILATION_CACHE=false keeps none.
@@ -32,6 +35,7 @@ def configure_jax(*, keep_programs: bool = True) -> None:
     """
     if jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
         raise UserError("JAX_ENABLE_X64 is set, but models here compute in 32 bits: unset it, or set it to 0")
+    accelerators.multiply_by_library()
     jax.config.update("jax_numpy_rank_promotion", "raise")
     # The heap of the calling thread keeps the memory of a step, see `keep_freed_memory`.
     jax.config.update("jax_cpu_enable_async_dispatch", False)

@@ -8,7 +8,7 @@ import pytest
 
 from tflane_jax import accelerators, processes
 from tflane_jax.ablations.workers import worker_threads
-from tflane_jax.accelerators import devices_of_task, gpus, leave_to_workers, of_worker
+from tflane_jax.accelerators import devices_of_task, gpus, multiply_by_library, of_worker
 from tflane_jax.training import provenance
 
 EIGHT = "0,1,2,3,4,5,6,7"
@@ -104,10 +104,39 @@ def test_gpus_are_found_without_a_variable_and_a_chosen_fraction_stays(tmp_path,
 
 
 def test_a_process_with_workers_reserves_no_memory(monkeypatch):
+    """Regression: a search for learning rates did, before its workers could: 14 of 15 found no memory on an H200."""
+    asked = []
+
+    def devices():
+        asked.append(os.environ.get("XLA_PYTHON_CLIENT_PREALLOCATE"))
+        return [SimpleNamespace(platform="gpu", device_kind="H200")]
+
+    monkeypatch.setattr(provenance.jax, "devices", devices)
     monkeypatch.setenv("XLA_PYTHON_CLIENT_PREALLOCATE", "")
     monkeypatch.delenv("XLA_PYTHON_CLIENT_PREALLOCATE")
-    leave_to_workers()
-    assert os.environ["XLA_PYTHON_CLIENT_PREALLOCATE"] == "false"
+    worker_threads(1)
+    worker_threads(1, cores=1)
+    assert asked == [None, "false"]
+
+
+def test_gpus_multiply_by_their_library(monkeypatch):
+    """Regression: XLA's own kernels ended every process that compiled the update of a lane shape model on an H200."""
+    monkeypatch.setenv("XLA_FLAGS", "--xla_some=1")
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0")
+    monkeypatch.delenv("JAX_PLATFORMS", raising=False)
+    multiply_by_library()
+    assert os.environ["XLA_FLAGS"] == "--xla_some=1"  # JAX cannot use the GPU
+    monkeypatch.setattr(accelerators.importlib.util, "find_spec", lambda name: name == "jax_cuda13_plugin")
+    multiply_by_library()
+    multiply_by_library()
+    assert os.environ["XLA_FLAGS"] == "--xla_some=1 --xla_gpu_enable_triton_gemm=false"
+    monkeypatch.setenv("XLA_FLAGS", "--xla_gpu_enable_triton_gemm=true")
+    multiply_by_library()
+    assert os.environ["XLA_FLAGS"] == "--xla_gpu_enable_triton_gemm=true"
+    monkeypatch.delenv("XLA_FLAGS")
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
+    multiply_by_library()
+    assert "XLA_FLAGS" not in os.environ
 
 
 def test_the_setting_of_a_worker_has_one_gpu(monkeypatch):

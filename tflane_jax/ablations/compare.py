@@ -26,7 +26,6 @@ from tflane_jax.ablations.report import save_report, suffixes
 from tflane_jax.ablations.results import Results
 from tflane_jax.ablations.scores import OWN_TEST, with_test_set
 from tflane_jax.ablations.workers import worker_threads
-from tflane_jax.accelerators import leave_to_workers
 from tflane_jax.config import RunConfig
 from tflane_jax.errors import UserError
 
@@ -69,8 +68,6 @@ def compare(
             or another declaration; a row's settings must fail, before any is trained; or trainings failed, after the
             tables of the others were written.
     """
-    if jobs > 1:
-        leave_to_workers()
     tests = dict(tests or {})
     _check_tests(configs, tests)
     if declaration is not None:

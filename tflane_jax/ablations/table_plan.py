@@ -15,7 +15,6 @@ from tflane_jax.ablations.paper.table import PaperTable
 from tflane_jax.ablations.reuse import thread_settings, with_recorded
 from tflane_jax.ablations.store import remaining_seconds, runs_elsewhere, stored_jobs
 from tflane_jax.ablations.workers import worker_threads
-from tflane_jax.accelerators import leave_to_workers
 from tflane_jax.config import RunConfig
 
 
@@ -74,8 +73,6 @@ def plan_table(
 
     Raises UserError where one of them must fail.
     """
-    if jobs > 1 or cores is not None:
-        leave_to_workers()
     rows, hosts = (table.configs(every, quick=quick) for every in (table.rows, table.hosts))
     check(table.declaration, rows)
     archive, store = archive or Archive(table.name, None, {}), store_of(out, quick=quick)

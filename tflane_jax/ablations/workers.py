@@ -51,9 +51,13 @@ def train_all(jobs: Sequence[Job], parallel: int, cores: int | None = None) -> l
 
 
 def worker_threads(parallel: int, cores: int | None = None) -> dict[str, Any]:
-    """Return the thread setting in which `train_all` trains; raise UserError for more cores than there are."""
+    """Return the thread setting in which `train_all` trains; raise UserError for more cores than there are.
+
+    A process that is going to have workers reserves no memory of GPUs from here on: asking JAX for its devices would.
+    """
     if parallel == 1 and cores is None:
         return thread_setting()
+    accelerators.leave_to_workers()
     return thread_setting(cores_each(parallel, cores) or None, devices=1)
 
 

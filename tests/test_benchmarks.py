@@ -20,7 +20,7 @@ from benchmarks import (
     metrics,
     paper_sizes,
 )
-from benchmarks.gpu import matching, steps
+from benchmarks.gpu import matching, side_by_side, steps
 from benchmarks.timing import command_line, compile_jax, interleave, markdown_table, summarise
 from tests.shared import ROOT
 from tflane_jax.ablations.paper.tf_lane import MASKING
@@ -33,7 +33,9 @@ from tflane_jax.runs import check_origin
 from tflane_jax.training.schedule import make_optimizer
 
 
-@pytest.mark.parametrize("name", ["metrics", "marker_occlusion", "paper_sizes", "marker_scenes", "gpu.matching"])
+@pytest.mark.parametrize(
+    "name", ["metrics", "marker_occlusion", "paper_sizes", "marker_scenes", "gpu.matching", "gpu.side_by_side"]
+)
 def test_options_of_the_benchmarks_have_one_name_and_one_default(name, monkeypatch):
     """Regression: --out was required in some, --rounds of one was --repeats of another."""
     module, seen = importlib.import_module(f"benchmarks.{name}"), []
@@ -134,6 +136,17 @@ def test_matching_on_the_device_is_compared_with_the_callback(tmp_path):
     record = matching.run(tmp_path, tiny=True, seconds=0.0)
     assert record["problems"]["tiny"]["same"]
     assert "| tiny" in (tmp_path / "gpu_matching.md").read_text()
+
+
+@pytest.mark.slow
+def test_trainings_that_share_a_device_count_together(tmp_path, monkeypatch):
+    monkeypatch.setenv("CUDA_MPS_PIPE_DIRECTORY", str(tmp_path))
+    name = side_by_side.CONFIGS[0]
+    record = side_by_side.run(tmp_path, [name], (1, 2), updates=2)
+    assert record["updates_per_s"][name].keys() == {"1", "2"}
+    assert min(record["updates_per_s"][name].values()) > 0
+    assert record["shared_by"] == "time slices"
+    assert json.loads((tmp_path / "gpu_side_by_side.json").read_text())["updates_per_s"] == record["updates_per_s"]
 
 
 @pytest.mark.slow

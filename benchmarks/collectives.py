@@ -29,7 +29,7 @@ import jax
 from benchmarks.timing import command_line, machine, markdown_table, save
 from tflane_jax.config import RunConfig, load_config
 from tflane_jax.devices import active, in_parts, training_mesh
-from tflane_jax.plan import ACCELERATORS, GIB, make_plan
+from tflane_jax.plan import ACCELERATORS, GIB, UTILISATION, make_plan
 from tflane_jax.scene import shapes_of
 from tflane_jax.training.runtime import configure_jax
 from tflane_jax.training.schedule import make_optimizer, scaled_to_batch
@@ -210,7 +210,9 @@ def main() -> None:
     parser.add_argument("--devices", type=int, nargs="+", default=list(DEVICES), help="numbers of devices")
     parser.add_argument("--paper", default="camera/toponet_r50", help="configuration of the estimate")
     parser.add_argument("--kind", choices=ACCELERATORS, default="h100", help="device of the estimate (default h100)")
-    parser.add_argument("--utilisation", type=float, default=0.4, help="assumed fraction of its peak (default 0.4)")
+    parser.add_argument(
+        "--utilisation", type=float, default=UTILISATION, help=f"assumed fraction of its peak (default {UTILISATION})"
+    )
     parser.add_argument("--only-estimate", action="store_true", help="compile nothing")
     parser.add_argument("--here", action="store_true", help=argparse.SUPPRESS)  # in a process that plays the devices
     options = parser.parse_args()

@@ -58,7 +58,7 @@ def test_memory_and_time_of_a_step(counted):
     assert plan.step_s == pytest.approx(computing + exchange)
     assert plan.rows[-1]["estimate"] == "time of 3,600 steps, hours"
     assert float(plan.rows[-1]["value"]) == pytest.approx(plan.step_s, rel=1e-2)
-    assert any("a guess" in sentence for sentence in plan.assumptions)
+    assert any("reaches 50% of the peak" in sentence for sentence in plan.assumptions)
 
 
 def test_parts_of_a_batch_take_memory_for_a_further_gradient_and_the_same_operations(counted):
@@ -112,7 +112,7 @@ def test_the_command_prints_an_estimate_with_its_assumptions(counted, monkeypatc
     assert main([*arguments, "--out", str(tmp_path / "plan")]) == 0
     printed = capsys.readouterr().out
     assert printed.startswith("Estimate, not a measurement: gtn_lane/lstr on 2 x a100")
-    assert "- computing reaches 50% of the peak: a guess" in printed
+    assert "- computing reaches 50% of the peak (--utilisation); measured" in printed
     assert (tmp_path / "plan.json").exists()
 
 

@@ -10,7 +10,7 @@ from tflane_jax.config import RunConfig, load_config
 from tflane_jax.config_overrides import apply_overrides
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import check_stem
-from tflane_jax.plan import make_plan
+from tflane_jax.plan import UTILISATION, make_plan
 from tflane_jax.plots.tables import format_table, save_table, written_to
 from tflane_jax.summary import parameter_counts, prediction_program, shapes_of_params, training_program
 from tflane_jax.training.runtime import configure_jax
@@ -77,7 +77,7 @@ def _check_together(options: argparse.Namespace) -> None:
     if options.depth is not None and options.depth < 1:
         raise UserError(f"--depth {options.depth}: at least one level of names")
     options.kind = options.kind or "h100"
-    options.utilisation = 0.25 if options.utilisation is None else options.utilisation
+    options.utilisation = UTILISATION if options.utilisation is None else options.utilisation
 
 
 def _plan(options: argparse.Namespace, config: RunConfig, example: Any) -> int:

@@ -197,7 +197,7 @@ def summary(commands) -> None:
     kinds = ["a100", "h100", "h200", "rtx3090", "rtx4090"]  # of plan.ACCELERATORS
     parser.add_argument("--kind", choices=kinds, help="with --plan: kind of the accelerators (default h100)")
     parser.add_argument(
-        "--utilisation", type=float, help="with --plan: fraction of the peak that is assumed (default 0.25)"
+        "--utilisation", type=float, help="with --plan: fraction of the peak that is assumed (default 0.04)"
     )
     parser.add_argument("--out", metavar="STEM", type=stem, help="write STEM.md and STEM.json")
     parser.set_defaults(takes_overrides=True)

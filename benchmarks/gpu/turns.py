@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+
+from tflane_jax.files.locks import take
 
 _FILE = Path(tempfile.gettempdir()) / "tflane_gpu_benchmarks.lock"
 
@@ -15,5 +16,5 @@ _FILE = Path(tempfile.gettempdir()) / "tflane_gpu_benchmarks.lock"
 def alone() -> Iterator[None]:
     """Wait until no other benchmark of this machine is inside this block."""
     with _FILE.open("w") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
+        take(file, wait=True)
         yield

@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from tflane_jax.errors import UserError
+from tflane_jax.files.locks import take
 from tflane_jax.startup import write
 
 
@@ -63,15 +64,10 @@ def cores_of_workers(workers: int, each: int) -> Iterator[list[list[int]]]:
 def _is_free(core: int, held: contextlib.ExitStack) -> bool:
     """Lock a core until `held` ends; return False if another command has it."""
     try:
-        import fcntl
-
         folder = Path(tempfile.gettempdir()) / f"tflane_jax-{os.getuid()}"
         folder.mkdir(mode=0o700, exist_ok=True)
         lock = os.open(folder / f"core_{core}.lock", os.O_CREAT | os.O_RDWR, 0o600)
         held.callback(os.close, lock)
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    except (ImportError, OSError):  # without locks, commands cannot know of each other
+    except (AttributeError, OSError):  # Windows, or a folder that is another user's: commands do not know of each other
         return True
-    return True
+    return take(lock)

@@ -33,6 +33,7 @@ from tflane_jax.datasets.leaves import example_from_leaves
 from tflane_jax.datasets.parallel import fill, frame_leaves, leaf_path
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import rename_flushed
+from tflane_jax.files.locks import take
 from tflane_jax.scene import Example
 
 # Errors of a folder that cannot be a cache.
@@ -303,28 +304,22 @@ def _summary(path: Path) -> dict[str, int]:
 
 @contextlib.contextmanager
 def _only_builder(folder: Path) -> Iterator[None]:
-    """Hold the entry's lock, which the system releases even if the process is killed."""
-    try:
-        import fcntl
-    except ImportError:
-        # Windows has no such locks; there, nothing prevents two processes from building one entry at once.
-        yield
-        return
+    """Hold the entry's lock. Where there are none, nothing prevents two processes from building one entry at once."""
+
+    def without_locks(reason: str) -> None:
+        print(
+            f"{folder.parent}: this file system has no locks ({reason}): processes that need the same examples at once "
+            "may each make them",
+            file=sys.stderr,
+        )
+
     path = folder.with_name(folder.name + ".lock")
     with contextlib.ExitStack() as stack:
         while True:
             lock = stack.enter_context(open(path, "w"))
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
+            if not take(lock, tell=without_locks):
                 print(f"waiting for another process that builds {folder.name}", file=sys.stderr)
-                fcntl.flock(lock, fcntl.LOCK_EX)
-            except OSError as error:
-                print(
-                    f"{folder.parent}: this file system has no locks ({error.strerror}): processes that need the same "
-                    "examples at once may each make them",
-                    file=sys.stderr,
-                )
+                take(lock, wait=True)
             # Whoever deletes an entry deletes its lock too, perhaps while this process waited for it.
             if _is_at(lock.fileno(), path):
                 break

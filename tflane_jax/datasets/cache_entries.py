@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tflane_jax.errors import UserError
+from tflane_jax.files.locks import take
 
 _KINDS = {"markers": "markers found in images", "programs": "compiled programs", "weights": "published weights"}
 _DATASET = re.compile(r".+-[0-9a-f]{16}(\.building-.*)?")
@@ -117,20 +118,8 @@ def _lock_of(path: Path) -> Path:
 @contextlib.contextmanager
 def _holding(lock: Path) -> Iterator[bool]:
     """Hold a lock file for the block if it is there and free; yield whether no other process holds it."""
-    try:
-        import fcntl
-    except ImportError:  # Windows: builds hold no lock
-        yield True
-        return
     if not lock.exists():
         yield True
         return
     with open(lock, "a") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            yield False
-        except OSError:  # a file system without locks
-            yield True
-        else:
-            yield True
+        yield take(file)

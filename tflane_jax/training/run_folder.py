@@ -20,6 +20,7 @@ from tflane_jax.config_io import first_difference
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import check_writable, is_temporary
 from tflane_jax.files.fields import load_json
+from tflane_jax.files.locks import take
 from tflane_jax.startup import write
 
 Start = Literal["new", "resume", "overwrite"]
@@ -141,17 +142,11 @@ def check_start(folder: Path, start: Start) -> None:
 
 
 def _lock(file: int, folder: Path) -> None:
-    """Take the lock; the system releases it even if the process is killed."""
-    try:
-        import fcntl
-    except ImportError:  # Windows: two processes in one folder are not detected
-        return
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError as error:
-        raise _in_use(folder) from error
-    except OSError as error:
-        write(f"{folder}: this file system has no locks ({error.strerror}): see to it that one process trains there")
+    def without_locks(reason: str) -> None:
+        write(f"{folder}: this file system has no locks ({reason}): see to it that one process trains there")
+
+    if not take(file, tell=without_locks):
+        raise _in_use(folder)
 
 
 def _in_use(folder: Path) -> UserError:
@@ -161,15 +156,10 @@ def _in_use(folder: Path) -> UserError:
 def is_locked(folder: Path) -> bool:
     """Return whether a process trains into the folder: another one, or this one."""
     try:
-        import fcntl
-
         with open(folder / "run.lock") as lock:
-            fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return True
-    except (ImportError, OSError):  # Windows, or a folder without a lock
+            return not take(lock, shared=True)
+    except OSError:  # a folder without a lock
         return False
-    return False
 
 
 def _delete(path: Path) -> None:

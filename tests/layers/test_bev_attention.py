@@ -12,7 +12,7 @@ from tests.golden import batch_leading, case_id, golden_modules, load_module_cas
 from tests.golden_compare import compare
 from tests.layers.batch_bugs import EXAMPLES, like_the_reference
 from tflane_jax.convert.bevformer import SPATIAL_ATTENTION, TEMPORAL_ATTENTION
-from tflane_jax.layers.bev_attention import SpatialCrossAttention, TemporalSelfAttention, first_seen
+from tflane_jax.layers.bev_attention import LOST, SpatialCrossAttention, TemporalSelfAttention, first_seen
 
 
 @pytest.mark.golden
@@ -110,10 +110,10 @@ def both(params, query, features, reference, visible, capacity):
     def apply(params, query, features):
         arguments = (query, features, SHAPES, reference, visible)
         module = SpatialCrossAttention(8, 2, 4, capacity)
-        return module.apply({"params": params}, *arguments, mutable=["intermediates"])
+        return module.apply({"params": params}, *arguments, mutable=[LOST])
 
     out, pull, sown = jax.vjp(apply, params, query, features, has_aux=True)
-    return (out, sown.get("intermediates", {})), pull(jnp.cos(jnp.arange(out.size)).reshape(out.shape))
+    return (out, sown.get(LOST, {})), pull(jnp.cos(jnp.arange(out.size)).reshape(out.shape))
 
 
 def run(variables, query, features, reference, visible, capacity=None):
@@ -130,12 +130,12 @@ def test_enough_capacity_changes_nothing_and_too_little_is_reported(variables):
     (compact, sown), by_compact = run(variables, query, features, reference, visible, int(counts.max()))
     np.testing.assert_allclose(compact, dense, atol=1e-6)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), by_compact, by_dense)
-    assert sown["overflow"] == (0,)
+    assert sown["camera_cells"] == (0,)
     # A query that no camera sees gets the bias of the projection alone.
     np.testing.assert_array_equal(dense[3], variables["params"]["output_proj"]["bias"])
     scarce = int(counts.max()) - 1
     (left_out, sown), _ = run(variables, query, features, reference, visible, scarce)
-    assert sown["overflow"] == (np.maximum(counts - scarce, 0).sum(),)
+    assert sown["camera_cells"] == (np.maximum(counts - scarce, 0).sum(),)
     # The last queries do without that camera, as if it did not see them.
     visible &= (np.cumsum(visible.any(-1), 1) <= scarce)[..., None]
     (expected, _), _ = run(variables, query, features, reference, visible)

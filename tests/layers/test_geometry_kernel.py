@@ -12,6 +12,7 @@ from tests.golden import case_id, golden_modules, load_module_case, options
 from tests.golden_compare import compare
 from tests.layers.batch_bugs import EXAMPLES, like_the_reference
 from tflane_jax.convert.bevformer import SPATIAL_ATTENTION
+from tflane_jax.layers.bev_attention import LOST
 from tflane_jax.layers.geometry_kernel import GeometryKernelAttention, kernel_offsets
 
 
@@ -74,10 +75,10 @@ def run(params, query, features, reference, visible, capacity=None):
 
     def apply(params, query, features):
         module = GeometryKernelAttention(8, 2, capacity=capacity)
-        return module.apply({"params": params}, query, features, [SHAPE], reference, visible, mutable=["intermediates"])
+        return module.apply({"params": params}, query, features, [SHAPE], reference, visible, mutable=[LOST])
 
     out, pull, sown = jax.vjp(apply, params, query, features, has_aux=True)
-    return out, sown.get("intermediates", {}), pull(jnp.cos(jnp.arange(out.size)).reshape(out.shape))
+    return out, sown.get(LOST, {}), pull(jnp.cos(jnp.arange(out.size)).reshape(out.shape))
 
 
 def test_it_is_the_sum_over_the_kernel_written_as_loops(params):
@@ -106,10 +107,10 @@ def test_enough_capacity_changes_nothing_and_too_little_is_reported(params):
     compact, sown, by_compact = run(params, query, features, reference, visible, capacity=int(counts.max()))
     np.testing.assert_allclose(compact, dense, atol=1e-5)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-4), by_compact, by_dense)
-    assert sown["overflow"] == (0,)
+    assert sown["camera_cells"] == (0,)
     scarce = int(counts.max()) - 1
     left_out, sown, _ = run(params, query, features, reference, visible, capacity=scarce)
-    assert sown["overflow"] == (np.maximum(counts - scarce, 0).sum(),)
+    assert sown["camera_cells"] == (np.maximum(counts - scarce, 0).sum(),)
     # The last queries do without that camera, as if it did not see them.
     visible &= (jnp.cumsum(visible.any(-1), 1) <= scarce)[..., None]
     expected, _, _ = run(params, query, features, reference, visible)

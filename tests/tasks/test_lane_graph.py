@@ -12,13 +12,14 @@ from tests.fakes import fake_prediction
 from tests.models.cases import BASELINE, WITH_TRAFFIC, make_example, make_line_example
 from tests.parameters import random_params
 from tests.priors.test_traffic_flow import make_flow
-from tflane_jax.config import RunConfig, WorldData
+from tflane_jax.config import RunConfig, WorldData, load_config
 from tflane_jax.datasets.base import ExampleConfig
 from tflane_jax.datasets.map_lines import MapLinesConfig
 from tflane_jax.errors import UserError
 from tflane_jax.evaluation.lane_groups import LANE_GROUPS
 from tflane_jax.evaluation.results import EvaluationConfig
 from tflane_jax.geometry import BevGrid, PerceptionRange
+from tflane_jax.layers.bev_attention import LOST
 from tflane_jax.markers.simulation import MarkerConfig
 from tflane_jax.models.area_decoder import AreaDecoderConfig
 from tflane_jax.models.bevformer_detr import BevFormerDetrConfig
@@ -31,7 +32,8 @@ from tflane_jax.models.priors import PriorsConfig
 from tflane_jax.models.toponet import TopoNetConfig
 from tflane_jax.models.traffic_flow_module import TrafficFlowConfig
 from tflane_jax.models.traffic_raster import TrafficRasterConfig
-from tflane_jax.scene import Prediction, stack_examples
+from tflane_jax.scene import Prediction, shapes_of, stack_examples
+from tflane_jax.tasks import lane_graph
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.tasks.traffic import limit_instances, queries_only
 from tflane_jax.world.bev.sensor import BevSensorConfig
@@ -43,6 +45,24 @@ LANES_AND_AREAS = LaneSegNetConfig(decoder=replace(LaneSegNetConfig().decoder, c
 
 def test_shipped_ranges_fit():
     RunConfig().task.check(WorldData(), EXAMPLES)
+
+
+def test_cells_beyond_a_capacity_are_counted():
+    """Regression: nothing read the count; only the first training example was checked before the first step."""
+    config = load_config("camera/toponet")
+    bev = config.task.model.encoder.bev
+    terms = {}
+    for capacity in (bev.capacity, None):
+        encoder = replace(config.task.model.encoder, bev=replace(bev, capacity=capacity))
+        task = replace(config.task, model=replace(config.task.model, encoder=encoder))
+        batch = shapes_of(task.shapes(config.data), 2)
+        params = jax.eval_shape(task.init, jax.random.key(0), task.shapes(config.data))
+        terms[capacity] = jax.eval_shape(task.loss, params, batch, jax.random.key(0))[1]
+    assert terms.pop(None).keys() == next(iter(terms.values())).keys() - task.notices.keys()
+    sown = {"encoder": {"layer_0": {"attention": {"camera_cells": (jnp.array(3),)}}}}
+    sown["encoder"]["layer_1"] = {"attention": {"camera_cells": (jnp.array(1), jnp.array(4))}}
+    assert lane_graph._lost({LOST: sown}) == {"lost/camera_cells": 4.0}
+    assert lane_graph._lost({}) == {}
 
 
 def test_a_raster_of_another_range_is_named():

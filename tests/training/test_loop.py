@@ -3,11 +3,13 @@
 import dataclasses
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
 import sys
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -47,6 +49,18 @@ def test_a_rerun_gives_the_same_bits(whole, tmp_path):
     run(tmp_path / "run")
     assert arrays(tmp_path / "run") == arrays(whole)
     assert timeless(tmp_path / "run") == timeless(whole)
+
+
+@dataclasses.dataclass(frozen=True)
+class Telling(LineTask):
+    notices: ClassVar = {"loss/fit": "It is above 0.", "loss/explosive": "It is not.", "lost/absent": "There is none."}
+
+
+def test_what_a_model_leaves_out_is_told_once(tmp_path, capsys):
+    run(tmp_path / "run", task=Telling())
+    told = [line for line in capsys.readouterr().err.splitlines() if "It is" in line or "There is" in line]
+    (line,) = told
+    assert re.fullmatch(r"step 4: loss/fit is [\d.]+\. It is above 0\.", line)
 
 
 def test_another_seed_gives_other_bits(whole, tmp_path):

@@ -16,6 +16,9 @@ from jaxtyping import Array, Bool, Float, Int
 from tflane_jax.layers.deformable import cell_units, offsets_and_logits
 from tflane_jax.layers.sampling import deformable_attention
 
+LOST = "lost"
+"""Collection of numbers of what a layer leaves out; they are counted only where a caller makes it mutable."""
+
 _INIT = nn.initializers.xavier_uniform()
 
 
@@ -77,7 +80,7 @@ class SpatialCrossAttention(nn.Module):
         heads, points: sampling points per head and level, divided among the anchors of a pillar.
         capacity: most queries per camera, to skip those that a camera does not see; None evaluates all queries in all
             cameras, with the same result if the capacity suffices. Beyond it, the last queries of the grid do without
-            that camera; their number is stored as the intermediate `overflow`.
+            that camera; their number is sown as `camera_cells` into the collection `LOST`.
         dtype: of the projections.
     """
 
@@ -119,7 +122,7 @@ class SpatialCrossAttention(nn.Module):
             total, served = deformable_attention(value, shapes, around, taken).sum(0), seen.sum(0)
         else:
             index = first_seen(seen, self.capacity)
-            self.sow("intermediates", "overflow", jnp.maximum(seen.sum(1) - self.capacity, 0).sum())
+            self.sow(LOST, "camera_cells", jnp.maximum(seen.sum(1) - self.capacity, 0).sum())
             pick = jnp.minimum(index, queries - 1)
             by_camera = jnp.take_along_axis(reference, pick[:, :, None, None], 1)
             around = jax.vmap(_around_anchors)(by_camera, offsets[pick])

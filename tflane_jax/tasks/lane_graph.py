@@ -9,7 +9,9 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal, TypeVar
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+from flax.traverse_util import flatten_dict
 from jax import lax
 from jaxtyping import Array, Float
 
@@ -26,6 +28,7 @@ from tflane_jax.evaluation.lane_graph import evaluate_lanes
 from tflane_jax.evaluation.results import Evaluation, EvaluationConfig
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.layers.batch_norm import BATCH_AXIS, STATISTICS
+from tflane_jax.layers.bev_attention import LOST
 from tflane_jax.limits import Count, SettingError
 from tflane_jax.losses.common import HostLossConfig
 from tflane_jax.losses.toponet import TopoNetLossConfig
@@ -69,6 +72,10 @@ class LaneGraphTask(Task[Example, Example | Streamed, LaneGraphSource, HostMemor
     columns: ClassVar[tuple[str, ...]] = score_names.COLUMNS
     compared: ClassVar[tuple[str, ...]] = score_names.COMPARED
     errors: ClassVar[tuple[str, ...]] = score_names.ERRORS
+    notices: ClassVar[Mapping[str, str]] = {
+        f"{LOST}/camera_cells": "BEV cells that a camera sees do without it, because it sees more than `capacity` of "
+        "BevFormerConfig: raise that, or leave it None"
+    }
 
     # -----------------------------------------------------------------------------------------------------------------
     # Learning
@@ -114,12 +121,12 @@ class LaneGraphTask(Task[Example, Example | Streamed, LaneGraphSource, HostMemor
 
         def frame(bev, statistics, example, observations, key):
             variables, streams = {"params": learned} | statistics, {"dropout": key}
-            kept, method = [STATISTICS, AUXILIARY], type(module).answer
+            kept, method = [STATISTICS, AUXILIARY, LOST], type(module).answer
             (outputs, bev), state = module.apply(
                 variables, example, bev, observations, train=True, method=method, mutable=kept, rngs=streams
             )
             updated = {name: value for name, value in state.items() if name == STATISTICS}
-            return bev, updated, (outputs, auxiliary_outputs(state))
+            return bev, updated, (outputs, auxiliary_outputs(state), _lost(state))
 
         def alone(example, observations, key):
             _, updated, found = frame(None, statistics, example, observations, key)
@@ -141,11 +148,11 @@ class LaneGraphTask(Task[Example, Example | Streamed, LaneGraphSource, HostMemor
         through_clips = self.clip > 1 and start.bev is not None
         keys = jax.random.split(key, len(jax.tree.leaves(batch)[0]))
         train: Any = jax.vmap(clip if through_clips else alone, axis_name=BATCH_AXIS, out_axes=(0, None))
-        (outputs, auxiliary), updated = train(batch, observations, keys)
+        (outputs, auxiliary, lost), updated = train(batch, observations, keys)
         if through_clips:
             outputs, auxiliary, batch = _frames((outputs, auxiliary, batch))
         loss, report = self.losses.loss(outputs, auxiliary, batch, self.model)
-        return loss, report | updated
+        return loss, report | {name: count.mean() for name, count in lost.items()} | updated
 
     def _observations(self, example: Example) -> ByPrior:
         """Return the priors' observations of a frame, or of each frame of a clip; they depend on no parameters."""
@@ -287,6 +294,15 @@ def _augmented(config: PhotometricConfig, example: Example, key: tuple[int, int,
         return augment_example(example, config, key)
     frames = [jax.tree.map(lambda leaf, i=i: leaf[i], example) for i in range(len(example.has_previous))]
     return stack_examples([augment_example(frame, config, (*key, i)) for i, frame in enumerate(frames)])
+
+
+def _lost(state: Any) -> dict[str, Float[Array, ""]]:
+    """Return what the layers of a model left out, by name: the most of any layer."""
+    counts: dict[str, Any] = {}
+    flat: Any = flatten_dict(state.get(LOST, {}))
+    for path, sown in flat.items():
+        counts.setdefault(f"{LOST}/{path[-1]}", []).extend(sown)
+    return {name: jnp.stack(of_layers).max().astype(jnp.float32) for name, of_layers in counts.items()}
 
 
 def _frames(clips: T) -> T:

@@ -236,6 +236,7 @@ def train(
             from_first(lambda: str(checkpoints.save(kept, manifest)))
 
         stepping, saved_step, stopped = 0.0, first, stop_signal(stop.signal, 0)
+        untold = dict(getattr(task, "notices", {}))
         with (
             RecordWriter(folder, first) if is_first() else Unwritten() as writer,
             progress_bar(total=config.steps, initial=first, desc=folder.name, unit="step", disable=not progress) as bar,
@@ -257,6 +258,8 @@ def train(
                 if step % config.log_every == 0 or is_last:
                     record = window.record(step)
                     writer.write(record | {"seconds": seconds})
+                    if is_first():
+                        _print_notices(_due(untold, record))
                     bar.set_postfix(loss=f"{np.mean(record['loss']):.4g}", refresh=False)
                     window = Window()
                 if evaluate is not None and (step % config.eval_every == 0 or is_last):
@@ -318,6 +321,12 @@ def _not_finite(values: dict[str, np.ndarray], step: int, seeds: tuple[int, ...]
         f"{kept}. Lower optim.lr or optim.clip_norm and train into another folder, from the start or from this run's "
         "averaged parameters (training.init_from)"
     )
+
+
+def _due(untold: dict[str, str], record: Record) -> list[str]:
+    """Return the notices whose terms are above 0 in a record, and take them from `untold`."""
+    due = [name for name in untold if np.max(record.get(name, 0.0)) > 0]
+    return [f"step {record['step']}: {name} is {np.max(record[name]):.3g}. {untold.pop(name)}" for name in due]
 
 
 def _print_notices(notices: Sequence[str]) -> None:

@@ -14,6 +14,7 @@ class Trainable(Protocol):
     """A model with its loss. Implementations are frozen dataclasses: jit takes them as static arguments.
 
     An attribute `loops` that is True says that the loss passes through the model in a loop (`tasks.base.Task.loops`).
+    An attribute `notices` has sentences by the name of a term: training prints one where its term is above 0, once.
     """
 
     def init(self, key: jax.Array, example: Any) -> Params:

@@ -1,7 +1,8 @@
 """Nine benchmarks, one after the other: `python -m benchmarks --out DIR` (what `tflane bench` runs).
 
 Alone run those of single findings (`lstr_layers`, `loop_convolutions`, `clip_scan`, `collectives`), of markers in
-images (`marker_*`), at the papers' sizes (`paper_sizes`) and on a GPU (`gpu.steps`, `gpu.matching`).
+images (`marker_*`), at the papers' sizes (`paper_sizes`) and on a GPU (`gpu.steps`, `gpu.matching`,
+`gpu.side_by_side`).
 """
 
 from __future__ import annotations

@@ -7,8 +7,12 @@ import jax
 import pytest
 
 from tflane_jax import accelerators, processes
+from tflane_jax.ablations import workers
+from tflane_jax.ablations.jobs import Job
 from tflane_jax.ablations.workers import worker_threads
-from tflane_jax.accelerators import devices_of_task, gpus, multiply_by_library, of_worker
+from tflane_jax.accelerators import devices_of_task, disable_triton_gemm, gpus, of_worker
+from tflane_jax.config import RunConfig
+from tflane_jax.errors import UserError
 from tflane_jax.training import provenance
 
 EIGHT = "0,1,2,3,4,5,6,7"
@@ -30,6 +34,10 @@ def slurm(visible=EIGHT, tasks="1(x4)", place=0, host=0, **further):
         (slurm(tasks="8(x2),1", place=0, host=2), list(range(8))),
         (slurm(tasks="8", place=3, visible="5"), [0]),  # bound in another way
         (slurm(tasks="3", place=1), None),
+        (
+            slurm(place=0, OMPI_MCA_orte_hnp_uri="x", OMPI_COMM_WORLD_LOCAL_RANK="3", OMPI_COMM_WORLD_LOCAL_SIZE="8"),
+            [3],
+        ),
         (slurm(visible=None), None),
         (slurm(visible=""), None),
         ({"CUDA_VISIBLE_DEVICES": "GPU-a,GPU-b", "OMPI_COMM_WORLD_LOCAL_RANK": "1"}, [0, 1]),
@@ -78,17 +86,18 @@ def test_a_process_that_is_given_its_place_ignores_the_cluster(joined):
         ("", 2, [{}, {}]),
         ("0,1", 2, [{"CUDA_VISIBLE_DEVICES": "0"}, {"CUDA_VISIBLE_DEVICES": "1"}]),
         ("GPU-a", 1, [{"CUDA_VISIBLE_DEVICES": "GPU-a"}]),
-        ("3", 2, [{"CUDA_VISIBLE_DEVICES": "3", "XLA_PYTHON_CLIENT_MEM_FRACTION": "0.450"}] * 2),
+        ("3", 2, [{"CUDA_VISIBLE_DEVICES": "3", "XLA_CLIENT_MEM_FRACTION": "0.450"}] * 2),
         (
             "6,7",
             3,
-            [{"CUDA_VISIBLE_DEVICES": name, "XLA_PYTHON_CLIENT_MEM_FRACTION": "0.450"} for name in ("6", "7", "6")],
+            [{"CUDA_VISIBLE_DEVICES": name, "XLA_CLIENT_MEM_FRACTION": "0.450"} for name in ("6", "7", "6")],
         ),
     ],
 )
 def test_workers_take_gpus_in_turn_and_share_their_memory(visible, parallel, expected, monkeypatch):
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
-    monkeypatch.delenv("XLA_PYTHON_CLIENT_MEM_FRACTION", raising=False)
+    for name in accelerators._FRACTIONS:
+        monkeypatch.delenv(name, raising=False)
     assert [of_worker(slot, parallel) for slot in range(parallel)] == expected
 
 
@@ -99,8 +108,34 @@ def test_gpus_are_found_without_a_variable_and_a_chosen_fraction_stays(tmp_path,
     for name in ("nvidia4", "nvidia6", "nvidiactl"):
         (tmp_path / name).touch()
     assert gpus() == ["0", "1"]  # CUDA numbers those that it sees
-    monkeypatch.setenv("XLA_PYTHON_CLIENT_MEM_FRACTION", "0.2")
-    assert of_worker(2, 3) == {"CUDA_VISIBLE_DEVICES": "0"}
+    for name in accelerators._FRACTIONS:  # where both are set, JAX computes on the CPU
+        monkeypatch.setenv(name, "0.2")
+        assert of_worker(2, 3) == {"CUDA_VISIBLE_DEVICES": "0"}
+        monkeypatch.delenv(name)
+
+
+@pytest.mark.parametrize("visible", ["-1", "NoDevFiles,0", "", " "])
+def test_names_from_which_cuda_sees_no_gpu(visible, monkeypatch):
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
+    assert gpus() == []
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", f"3,{visible}")
+    assert gpus() == ["3"] or visible == "NoDevFiles,0"
+
+
+def test_the_subsystem_for_linux_has_one_gpu(tmp_path, monkeypatch):
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+    monkeypatch.setattr(accelerators, "Path", lambda path: tmp_path)
+    (tmp_path / "dxg").touch()
+    assert gpus() == ["0"]
+
+
+def test_flags_of_gpus_are_not_in_the_setting_of_a_cpu(monkeypatch):
+    monkeypatch.setenv("XLA_FLAGS", "--xla_gpu_enable_triton_gemm=false")
+    assert "XLA_FLAGS" not in provenance.thread_setting()
+    monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_one=1 --xla_gpu_enable_triton_gemm=false")
+    assert provenance.thread_setting()["XLA_FLAGS"] == "--xla_cpu_one=1"
+    monkeypatch.setattr(provenance.jax, "devices", lambda: [SimpleNamespace(platform="gpu", device_kind="H100")])
+    assert provenance.thread_setting()["XLA_FLAGS"].endswith("--xla_gpu_enable_triton_gemm=false")
 
 
 def test_a_process_with_workers_reserves_no_memory(monkeypatch):
@@ -119,23 +154,23 @@ def test_a_process_with_workers_reserves_no_memory(monkeypatch):
     assert asked == [None, "false"]
 
 
-def test_gpus_multiply_by_their_library(monkeypatch):
+def test_triton_kernels_are_disabled_on_gpus(monkeypatch):
     """Regression: XLA's own kernels ended every process that compiled the update of a lane shape model on an H200."""
     monkeypatch.setenv("XLA_FLAGS", "--xla_some=1")
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0")
     monkeypatch.delenv("JAX_PLATFORMS", raising=False)
-    multiply_by_library()
+    disable_triton_gemm()
     assert os.environ["XLA_FLAGS"] == "--xla_some=1"  # JAX cannot use the GPU
     monkeypatch.setattr(accelerators.importlib.util, "find_spec", lambda name: name == "jax_cuda13_plugin")
-    multiply_by_library()
-    multiply_by_library()
+    disable_triton_gemm()
+    disable_triton_gemm()
     assert os.environ["XLA_FLAGS"] == "--xla_some=1 --xla_gpu_enable_triton_gemm=false"
     monkeypatch.setenv("XLA_FLAGS", "--xla_gpu_enable_triton_gemm=true")
-    multiply_by_library()
+    disable_triton_gemm()
     assert os.environ["XLA_FLAGS"] == "--xla_gpu_enable_triton_gemm=true"
     monkeypatch.delenv("XLA_FLAGS")
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
-    multiply_by_library()
+    disable_triton_gemm()
     assert "XLA_FLAGS" not in os.environ
 
 
@@ -143,3 +178,11 @@ def test_the_setting_of_a_worker_has_one_gpu(monkeypatch):
     monkeypatch.setattr(provenance.jax, "devices", lambda: [SimpleNamespace(platform="gpu", device_kind="H100")] * 8)
     monkeypatch.setattr(provenance.jax, "device_count", lambda: 8)
     assert [worker_threads(parallel)["device"] for parallel in (1, 2)] == ["gpu: H100 x 8", "gpu: H100 x 1"]
+
+
+def test_a_worker_refuses_a_run_that_was_planned_for_another_device(tmp_path):
+    """Regression: a worker whose GPU JAX did not find trained on the CPU, recorded as planned."""
+    here = provenance.thread_setting()
+    workers._check_setting(Job(RunConfig(), tmp_path, threads=here))
+    with pytest.raises(UserError, match="another setting than was planned: .*H100"):
+        workers._check_setting(Job(RunConfig(), tmp_path, threads=here | {"device": "gpu: H100 x 1"}))

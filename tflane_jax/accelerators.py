@@ -7,14 +7,16 @@ each process, however many the job gave it.
 from __future__ import annotations
 
 import importlib.util
+import itertools
 import os
 import re
 from collections.abc import Mapping
 from pathlib import Path
 
 _VISIBLE = "CUDA_VISIBLE_DEVICES"
-_FRACTION = "XLA_PYTHON_CLIENT_MEM_FRACTION"
+_FRACTIONS = ("XLA_CLIENT_MEM_FRACTION", "XLA_PYTHON_CLIENT_MEM_FRACTION")  # its name, and the one it had
 _SHARED_FRACTION = 0.9
+_NO_GPU = ("-1", "NoDevFiles")  # CUDA sees no GPU from such a name on
 _PLUGINS = ("jax_cuda13_plugin", "jax_cuda12_plugin")
 _TRITON = "--xla_gpu_enable_triton_gemm"
 
@@ -47,7 +49,9 @@ def devices_of_task(environment: Mapping[str, str]) -> list[int] | None:
 
 def _tasks_on_host(environment: Mapping[str, str]) -> tuple[int, int]:
     """Return how many processes of the job are on this host, and the number of this one among them."""
-    if "SLURM_LOCALID" in environment:
+    # Slurm's variables in processes of mpirun are those of the batch script. JAX tells them in the same way.
+    by_mpirun = "OMPI_MCA_orte_hnp_uri" in environment and "OMPI_COMM_WORLD_LOCAL_RANK" in environment
+    if "SLURM_LOCALID" in environment and not by_mpirun:
         counts: list[int] = []
         written = environment.get("SLURM_STEP_TASKS_PER_NODE", environment.get("SLURM_TASKS_PER_NODE", "1"))
         for count, repeats in re.findall(r"(\d+)(?:\(x(\d+)\))?", written):  # "2(x3),1": 2, 2, 2 and 1
@@ -65,8 +69,13 @@ def gpus() -> list[str]:
     JAX is not asked, because it would reserve their memory.
     """
     if (visible := os.environ.get(_VISIBLE)) is not None:
-        return [name.strip() for name in visible.split(",") if name.strip()]
-    return [str(place) for place, _ in enumerate(Path("/dev").glob("nvidia[0-9]*"))]
+        names = [name.strip() for name in visible.split(",") if name.strip()]
+        return list(itertools.takewhile(lambda name: name not in _NO_GPU, names))
+    devices = Path("/dev")
+    found = list(devices.glob("nvidia[0-9]*")) or list(
+        devices.glob("dxg")
+    )  # Windows' subsystem for Linux has the latter
+    return [str(place) for place, _ in enumerate(found)]
 
 
 def of_worker(slot: int, parallel: int) -> dict[str, str]:
@@ -78,8 +87,9 @@ def of_worker(slot: int, parallel: int) -> dict[str, str]:
     if not (names := gpus()):
         return {}
     found = {_VISIBLE: names[slot % len(names)]}
-    if (sharing := -(-parallel // len(names))) > 1 and _FRACTION not in os.environ:
-        found[_FRACTION] = f"{_SHARED_FRACTION / sharing:.3f}"
+    # JAX computes on the CPU, with no more than a logged error, where both names are set.
+    if (sharing := -(-parallel // len(names))) > 1 and not any(name in os.environ for name in _FRACTIONS):
+        found[_FRACTIONS[0]] = f"{_SHARED_FRACTION / sharing:.3f}"
     return found
 
 
@@ -88,12 +98,12 @@ def leave_to_workers() -> None:
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
 
 
-def multiply_by_library() -> None:
-    """Let XLA leave products of matrices on GPUs to NVIDIA's library, unless XLA_FLAGS says how they are made.
+def disable_triton_gemm() -> None:
+    """Disable XLA's Triton kernels for matrix products, so that cuBLAS computes them, unless XLA_FLAGS sets them.
 
-    XLA's own kernels for them end the process while it compiles, with a failed check in triton_tiling_propagation.cc
-    (openxla/xla issue 47381; seen with jaxlib 0.11.2 on the update of the lane shape models). To be called before JAX
-    looks for its devices. Without a GPU that JAX can use, nothing changes.
+    They end the process while it compiles, with a failed check in triton_tiling_propagation.cc (openxla/xla issue
+    47381; seen with jaxlib 0.11.2 on the update of the lane shape models). To be called before JAX looks for its
+    devices. Without a GPU nothing changes.
     """
     if os.environ.get("JAX_PLATFORMS") == "cpu" or not gpus():
         return

@@ -57,6 +57,12 @@ def _run_command(options: argparse.Namespace, rest: Sequence[str]) -> int:
     except BrokenPipeError:  # `tflane ... | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 128 + signal.SIGPIPE
+    except RuntimeError as error:
+        if "RESOURCE_EXHAUSTED" not in str(error):  # as XLA says it
+            raise
+        remedies = "a smaller training.batch_size or evaluation.batch_size, training.accumulate, precision or remat"
+        print(f"tflane: the memory of the device is full: {remedies} (docs/scale.md)", file=sys.stderr)
+        return 2
     except OSError as error:
         # pathlib raises these wherever it looks for such a file
         if error.filename is None or error.errno not in (errno.ENAMETOOLONG, errno.EACCES, errno.EPERM):

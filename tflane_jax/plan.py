@@ -133,7 +133,7 @@ def make_plan(
             f"{kind}: {device.memory:g} GB, {peak:g} TFLOP/s of {'bfloat16' if half else 'float32 (TF32)'} products, "
             f"{device.link:g} GB/s to the others; peak numbers of the data sheet",
             f"computing reaches {utilisation:.0%} of the peak (--utilisation); measured for single examples of "
-            f"LaneSegNet and MapTRv2 on an H200: {UTILISATION:.0%}",
+            f"LaneSegNet and MapTRv2 in bfloat16 on an H200: {UTILISATION:.0%}",
             "operations are XLA's count before fusion; frames of a clip and parts of a batch all count",
             "gradients and activations need what the compiler for this machine plans; a GPU's plan differs",
             "gradients are exchanged after computing, in a ring, at full speed of the link",

@@ -78,6 +78,8 @@ def run(
     out: Path, configs: Sequence[str] = CONFIGS, processes: Sequence[int] = PROCESSES, *, updates: int = 200
 ) -> dict[str, Any]:
     """Measure every configuration with every number of processes, print and write `gpu_side_by_side.json` and `.md`."""
+    if found := accelerators.gpus():
+        os.environ["CUDA_VISIBLE_DEVICES"] = found[0]
     accelerators.leave_to_workers()
     context, most = multiprocessing.get_context("spawn"), max(processes)
     start, pipes, workers, ready_s = context.Semaphore(0), [], [], []

@@ -1,4 +1,4 @@
-"""Updates at the papers' sizes on an accelerator: time, memory, fraction of the peak.
+"""Updates at the papers' sizes on an accelerator: time and memory.
 
     python -m benchmarks.gpu.steps --out runs/bench --kind h100
     python -m benchmarks.gpu.steps --out runs/bench --models toponet --batch 4 --precision float32 --remat
@@ -8,7 +8,7 @@ TopoNet, LaneSegNet and MapTRv2 make updates of one batch of invented numbers in
 the slots for lanes is valid, images are noise. Parameters are invented too, and losses mean nothing. The time of
 matching on the device depends on the number of lanes. The fraction of the peak is XLA's count of operations before
 fusion, divided by time and the data sheet's peak; XLA for GPUs does not count them (seen with jax 0.11.2), and `tflane
-summary --plan` does on a CPU. Peak memory includes what XLA tries while it chooses convolutions. Every model has a
+summary --plan` does on a CPU. Peak memory may include what XLA tries while it chooses convolutions. Every model has a
 process of its own: all compile at the same time, and run one after the other.
 """
 

@@ -114,6 +114,7 @@ try:
         from tflane_jax.ablations import jobs, workers
         from tflane_jax.config import load_config
         workers.train_run = steps
+        workers._check_setting = lambda job: None  # making a setting would start JAX before the worker configures it
         here, there = multiprocessing.Pipe()
         here.send(jobs.Job(load_config("gtn_lane/gtn"), Path(folder), threads={}))
         workers._train_jobs(there, [], {})

@@ -22,6 +22,7 @@ from tflane_jax.ablations.reservations import Reservations
 from tflane_jax.ablations.scores import code_digest, is_measured, measure_all
 from tflane_jax.ablations.training_queue import Queue
 from tflane_jax.child_processes import end_with_parent
+from tflane_jax.config_io import first_difference
 from tflane_jax.errors import Interrupted, UserError
 from tflane_jax.memory import give_back_freed_memory, huge_pages_for_children, keep_freed_memory
 from tflane_jax.progress import progress_bar
@@ -55,6 +56,7 @@ def worker_threads(parallel: int, cores: int | None = None) -> dict[str, Any]:
 
     A process that is going to have workers reserves no memory of GPUs from here on: asking JAX for its devices would.
     """
+    accelerators.disable_triton_gemm()  # as workers do
     if parallel == 1 and cores is None:
         return thread_setting()
     accelerators.leave_to_workers()
@@ -111,7 +113,7 @@ def _train_in_workers(queue: Queue, jobs: Sequence[Job], parallel: int, cores: i
     built: set[Any] = set()
     with contextlib.ExitStack() as stack:
         shares = stack.enter_context(cores_of_workers(min(parallel, len(queue)), cores_each(parallel, cores)))
-        workers = [stack.enter_context(Worker(share, slot, parallel)) for slot, share in enumerate(shares)]
+        workers = [stack.enter_context(Worker(share, slot, len(shares))) for slot, share in enumerate(shares)]
         stack.callback(lambda: [worker.end() for worker in workers])  # before any of them is waited for
         total, done = sum(job.config.training.steps for job in jobs), sum(job.step() for job in jobs)
         bar = stack.enter_context(
@@ -235,6 +237,12 @@ def _death(code: int) -> str:
     return f"its worker process was killed by {name}{hint}"
 
 
+def _check_setting(job: Job) -> None:
+    """Raise UserError if this process would not train as planned, as on a CPU because JAX found no GPU."""
+    if difference := first_difference(thread_setting(), dict(job.threads)):
+        raise UserError(f"the process that trains has another setting than was planned: {difference}")
+
+
 def _train(job: Job) -> None:
     result = train_run(job.config, job.folder, start=job.start(), progress=False)
     if result.stopped_by is not None:
@@ -270,6 +278,7 @@ def _train_jobs(pipe: Any, cores: list[int], accelerator: Mapping[str, str]) -> 
                 configure_jax()
                 with noted(job, failures), showing(begin):
                     if not job.is_complete():
+                        _check_setting(job)
                         _train(job)
                     measure_all(job)
             give_back_freed_memory()

@@ -6,6 +6,8 @@ import argparse
 from collections.abc import Sequence
 from typing import Any
 
+import jax
+
 from tflane_jax.config import RunConfig, load_config
 from tflane_jax.config_overrides import apply_overrides
 from tflane_jax.errors import UserError
@@ -21,6 +23,8 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> int:
     _check_together(options)
     if options.out is not None:
         check_stem(options.out)
+    # XLA for GPUs counts no operations, and nothing here runs.
+    jax.config.update("jax_platforms", "cpu")
     configure_jax(keep_programs=False)  # compiling is timed
     config = load_config(options.config) if options.config else RunConfig()
     config = apply_overrides(config, overrides)

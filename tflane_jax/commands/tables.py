@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from tflane_jax import accelerators
 from tflane_jax.ablations.paper.cost import core_minutes
 from tflane_jax.ablations.paper.table import Conversion, PaperTable
 from tflane_jax.ablations.published import record
@@ -45,6 +46,8 @@ def run(options: argparse.Namespace) -> int:
         print(f"\n{_totals()}")
         return 0
     configure_jax()
+    if jobs > 1 or options.cores is not None:
+        accelerators.leave_to_workers()  # before converting uses a device
     for table in chosen:
         _convert(table.conversions)
     if options.search:

@@ -85,11 +85,11 @@ def _config(options: argparse.Namespace, out: Path, overrides: Sequence[str]) ->
 
 
 def _print_devices() -> None:
-    """Print how many devices share the training, so that a missing one is noticed."""
+    """Print how many devices share the training, and which: a missing one is noticed, and that a GPU is used."""
     number, devices = jax.process_count(), jax.devices()
-    if processes.is_first() and (number > 1 or len(devices) > 1):
+    if processes.is_first() and (number > 1 or len(devices) > 1 or devices[0].platform != "cpu"):
         joined = f"{number} processes, " if number > 1 else ""
-        write(f"{joined}{len(devices)} devices ({devices[0].device_kind})")
+        write(f"{joined}{len(devices)} device{'s' * (len(devices) > 1)} ({devices[0].device_kind})")
 
 
 def _saved_at(out: Path) -> int | None:

@@ -70,10 +70,10 @@ def inside_image(pixels: Float[ArrayT, "*b 2"], width: int, height: int) -> Bool
 def resize_intrinsics(intrinsics: Float[ArrayT, "*b 3 3"], scale: tuple[float, float]) -> Float[ArrayT, "*b 3 3"]:
     """Return the intrinsics after the image's width and height were multiplied by `scale`."""
     xp = namespace(intrinsics)
-    return xp.diag(constants([*scale, 1.0], intrinsics)) @ intrinsics
+    return product(xp.diag(constants([*scale, 1.0], intrinsics)), intrinsics)
 
 
 def crop_intrinsics(intrinsics: Float[ArrayT, "*b 3 3"], corner: tuple[float, float]) -> Float[ArrayT, "*b 3 3"]:
     """Return the intrinsics after the image was cut so that pixel `corner` (u, v) became its top-left corner."""
     u, v = corner
-    return constants([[1.0, 0.0, -u], [0.0, 1.0, -v], [0.0, 0.0, 1.0]], intrinsics) @ intrinsics
+    return product(constants([[1.0, 0.0, -u], [0.0, 1.0, -v], [0.0, 0.0, 1.0]], intrinsics), intrinsics)

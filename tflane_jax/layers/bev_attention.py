@@ -122,7 +122,8 @@ class SpatialCrossAttention(nn.Module):
             total, served = deformable_attention(value, shapes, around, taken).sum(0), seen.sum(0)
         else:
             index = first_seen(seen, self.capacity)
-            self.sow(LOST, "camera_cells", jnp.maximum(seen.sum(1) - self.capacity, 0).sum())
+            if not self.is_initializing():
+                self.sow(LOST, "camera_cells", jnp.maximum(seen.sum(1) - self.capacity, 0).sum())
             pick = jnp.minimum(index, queries - 1)
             by_camera = jnp.take_along_axis(reference, pick[:, :, None, None], 1)
             around = jax.vmap(_around_anchors)(by_camera, offsets[pick])

@@ -76,7 +76,8 @@ class GeometryKernelAttention(nn.Module):
             total, served = kernel_sum(value, shapes[0], around, taken, self.kernel).sum(0), seen.sum(0)
         else:
             index = first_seen(seen, self.capacity)
-            self.sow(LOST, "camera_cells", jnp.maximum(seen.sum(1) - self.capacity, 0).sum())
+            if not self.is_initializing():
+                self.sow(LOST, "camera_cells", jnp.maximum(seen.sum(1) - self.capacity, 0).sum())
             pick, there = jnp.minimum(index, queries - 1), (index < queries)[:, :, None, None]
             around = jnp.where(there, jnp.take_along_axis(reference, pick[:, :, None, None], 1), 0.0)
             found = kernel_sum(value, shapes[0], around, jnp.where(there, weights[pick], 0.0), self.kernel)

@@ -269,5 +269,5 @@ def _lines(points: Float[Array, "*b p 3"], control_points: int | None) -> Float[
     """Return the points or the control points of a centerline as one vector."""
     if control_points is not None:
         fit = bezier_fit(points.shape[-2], control_points).astype(points.dtype)
-        points = jnp.einsum("kp,...pc->...kc", fit, points)
+        points = jnp.einsum("kp,...pc->...kc", fit, points, precision="highest")
     return points.reshape(*points.shape[:-2], points.shape[-2] * points.shape[-1])  # -1 fails without lanes

@@ -128,7 +128,7 @@ class BevFormerDetr(Host):
             return lanes
         points = jnp.asarray(lanes.points)
         fit = jnp.asarray(bezier_fit(points.shape[-2], controls), points.dtype)
-        return replace(lanes, points=jnp.einsum("kp,npc->nkc", fit, points))
+        return replace(lanes, points=jnp.einsum("kp,npc->nkc", fit, points, precision="highest"))
 
     def decode_queries(self, start, bev, elements, tokens, deterministic) -> Prediction:
         """Return the predictions of one set of queries; `start` as from `LaneQueries`."""
@@ -147,6 +147,7 @@ class BevFormerDetr(Host):
             output = heads(queries, reference, bev, element_queries)
             if controls is not None:
                 basis = jnp.asarray(bezier_basis(self.config.decoder.points, controls), output.points.dtype)
-                output = output._replace(points=jnp.einsum("pk,qkc->qpc", basis, output.points))
+                points = jnp.einsum("pk,qkc->qpc", basis, output.points, precision="highest")
+                output = output._replace(points=points)
             outputs.append(output)
         return make_prediction(outputs, elements)

@@ -141,7 +141,7 @@ def _in_bin(coefficients: Float[Array, "q p 3"], config: LaneDecoderConfig) -> F
     # Column 1 of the basis falls from 1 to -1 along the lane.
     straight[0, 1, 0] = -_HALF_LENGTH
     coefficients = jnp.asarray(straight) + coefficients * jnp.asarray(config.metres)[None, None]
-    return jnp.einsum("pk,qkc->qpc", smooth_basis(config.points), coefficients)
+    return jnp.einsum("pk,qkc->qpc", smooth_basis(config.points), coefficients, precision="highest")
 
 
 def _placed(

@@ -128,7 +128,8 @@ class SegmentHeads(nn.Module):
         """Return left and right boundary, metres."""
         config = self.config
         if config.offsets == "lane":
-            along, across, up = jnp.moveaxis(jnp.einsum("pk,qkc->qpc", smooth_basis(config.points), offset), -1, 0)
+            offset = jnp.einsum("pk,qkc->qpc", smooth_basis(config.points), offset, precision="highest")
+            along, across, up = jnp.moveaxis(offset, -1, 0)
             heading = jax.lax.stop_gradient(directions(points[..., :2]))
             across = across + _HALF_WIDTH
             cos, sin = heading[..., 0], heading[..., 1]

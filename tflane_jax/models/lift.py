@@ -241,7 +241,7 @@ def camera_vector(
     count = len(native)
     lens = jnp.stack([native[:, 0, 0], native[:, 1, 1], native[:, 0, 2], native[:, 1, 2]], -1)
     rotation = camera_from_ego[:, :3, :3].swapaxes(1, 2)
-    place = -jnp.einsum("vij,vj->vi", rotation, camera_from_ego[:, :3, 3])
+    place = -jnp.einsum("vij,vj->vi", rotation, camera_from_ego[:, :3, 3], precision="highest")
     pose = jnp.concatenate([rotation, place[..., None]], -1).reshape(count, 12)
     return jnp.concatenate([lens, affine.reshape(count, 6), pose], -1)
 

@@ -48,9 +48,12 @@ def thread_setting(cores: int | None = None, devices: int | None = None) -> dict
     """
     if cores is None:
         cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    setting = {"cores": cores} | {name: os.environ[name] for name in _VARIABLES if name in os.environ}
+    setting: dict[str, Any] = {"cores": cores} | {name: os.environ[name] for name in _VARIABLES if name in os.environ}
     device = _device(devices)
-    return setting if device.startswith(_CPU) else setting | {"device": device}
+    if not device.startswith(_CPU):
+        return setting | {"device": device}
+    flags = [flag for flag in setting.pop("XLA_FLAGS", "").split() if not flag.startswith("--xla_gpu_")]
+    return setting | ({"XLA_FLAGS": " ".join(flags)} if flags else {})
 
 
 def threads_of(start: dict[str, Any]) -> dict[str, Any] | None:

@@ -24,7 +24,7 @@ _PROGRAMS = 2 * 2**30  # bytes of kept programs
 def configure_jax(*, keep_programs: bool = True) -> None:
     """Make silent broadcasting between ranks an error, keep freed memory and compiled programs, trace faster.
 
-    On GPUs, products of matrices are left to NVIDIA's library, see `accelerators.multiply_by_library`.
+    On GPUs, cuBLAS computes matrix products, see `accelerators.disable_triton_gemm`.
 
     Args:
         keep_programs: keep compiled programs for the next process, in the folder `programs` of the cache (TFLANE_CACHE)
@@ -35,7 +35,7 @@ def configure_jax(*, keep_programs: bool = True) -> None:
     """
     if jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
         raise UserError("JAX_ENABLE_X64 is set, but models here compute in 32 bits: unset it, or set it to 0")
-    accelerators.multiply_by_library()
+    accelerators.disable_triton_gemm()
     jax.config.update("jax_numpy_rank_promotion", "raise")
     # The heap of the calling thread keeps the memory of a step, see `keep_freed_memory`.
     jax.config.update("jax_cpu_enable_async_dispatch", False)
@@ -53,7 +53,8 @@ def _keep_programs(folder: Path) -> None:
     """Let JAX keep compiled programs in a folder; the oldest are dropped where they are more than 2 GiB."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        files = sorted(((file.stat(), file) for file in folder.iterdir()), key=lambda pair: -pair[0].st_mtime)
+        files = [file for file in folder.iterdir() if file.is_file()]  # XLA keeps a folder there, on GPUs
+        files = sorted(((file.stat(), file) for file in files), key=lambda pair: -pair[0].st_mtime)
         total = 0
         for found, file in files:
             total += found.st_size

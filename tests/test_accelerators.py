@@ -184,5 +184,5 @@ def test_a_worker_refuses_a_run_that_was_planned_for_another_device(tmp_path):
     """Regression: a worker whose GPU JAX did not find trained on the CPU, recorded as planned."""
     here = provenance.thread_setting()
     workers._check_setting(Job(RunConfig(), tmp_path, threads=here))
-    with pytest.raises(UserError, match="another setting than was planned: .*H100"):
+    with pytest.raises(UserError, match=r"another setting than was planned: .*H100"):
         workers._check_setting(Job(RunConfig(), tmp_path, threads=here | {"device": "gpu: H100 x 1"}))

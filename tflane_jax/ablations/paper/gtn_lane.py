@@ -94,7 +94,8 @@ TABLES = (
         quoted=_QUOTED,
         seeds=5,
         minutes=17.0,
-        search=RateSearch(tuple(_ENCODERS), (5e-4, 1e-3, 2e-3), "all/Accuracy"),
+        # In 4,000 steps the transformer's accuracy was 90, 64 and 70 by seed: one seed says little about a rate.
+        search=RateSearch(tuple(_ENCODERS), (5e-4, 1e-3, 2e-3), "all/Accuracy", seeds=(1000, 1001, 1002)),
         note=f"{_SPEED} {_BY_HAND}",
     ),
     PaperTable(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
@@ -23,7 +23,7 @@ from tflane_jax.datasets.lane_rows import LabelledImages
 from tflane_jax.datasets.photos import HEIGHT as INPUT_HEIGHT
 from tflane_jax.datasets.photos import WIDTH as INPUT_WIDTH
 from tflane_jax.datasets.streaming import Prepare, Streamed
-from tflane_jax.datasets.tusimple import TuSimpleConfig
+from tflane_jax.datasets.tusimple import FRAME_SIZE, TuSimpleConfig, TuSimpleData
 from tflane_jax.evaluation import lane_shapes
 from tflane_jax.evaluation.by_scene import summed_ratio
 from tflane_jax.evaluation.predict import (
@@ -124,6 +124,12 @@ class LaneShapeTask(Task[RoadImage, LabelledImages, ImageSource, None]):
         """Return the images of a source, in memory or streamed, with their labels."""
         return sources.load(source, progress=progress)
 
+    def training_form(self, source: ImageSource, data: SplitData) -> ImageSource:
+        """Return a split with TuSimple's full frames where they are augmented: one warp crops and resizes them."""
+        if isinstance(source, TuSimpleConfig) and _cropped(data):
+            return replace(source, height=FRAME_SIZE[0], width=FRAME_SIZE[1])
+        return source
+
     def examples(self, data: LabelledImages) -> RoadImage | Streamed:
         """Return the images with their lane lines."""
         return data.images
@@ -146,9 +152,10 @@ class LaneShapeTask(Task[RoadImage, LabelledImages, ImageSource, None]):
         augmentation = getattr(data, "augmentation", None)
         if augmentation is None:
             return None
+        size = (INPUT_HEIGHT, INPUT_WIDTH) if _cropped(data) else None
 
         def prepare(example: RoadImage, key: tuple[int, int, int]) -> RoadImage:
-            return augment(example, augmentation, key)
+            return augment(example, augmentation, key, size)
 
         return prepare
 
@@ -221,6 +228,11 @@ class LaneShapeTask(Task[RoadImage, LabelledImages, ImageSource, None]):
             }
             for name, fps, accuracy, fp, fn in GTN_TABLE_1
         ]
+
+
+def _cropped(data: SplitData) -> bool:
+    """Return whether augmentation takes full frames, larger than the network's input."""
+    return isinstance(data, TuSimpleData) and data.augmentation is not None
 
 
 def found_lanes(prediction: CurvePrediction, truth: RowLanes, threshold: float | None = None) -> RowLanes:

@@ -20,6 +20,8 @@ HORIZON = 0.331
 # Assumed, not measured: 714 pixels of 1280, the calibration of TuSimple's velocity benchmark as others quote it.
 # TuSimple publishes none for its lane images, and the labels do not determine it: flat straight lanes look alike at
 # every focal length, and the dashes in the ten frames at hand are too faint to measure their period.
+# The built-in world's front views are drawn with 900 to 1100 pixels (`world.render.camera`), which was not measured
+# either.
 FOCAL = 714.15 / 1280
 
 # How far off the horizon of a view may be, of its height, and its aspect, a factor: 4:3 and 21:9 pass.

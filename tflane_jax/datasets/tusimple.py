@@ -29,12 +29,9 @@ from tflane_jax.datasets.photos import HEIGHT, WIDTH
 from tflane_jax.datasets.streaming import Streamed, StreamingConfig
 from tflane_jax.errors import UserError
 from tflane_jax.files.images import read_image, resize
-from tflane_jax.files.tusimple import RowLanes, read_truth
+from tflane_jax.files.tusimple import NO_DRIVES, RowLanes, read_truth
 from tflane_jax.progress import progress_bar
 from tflane_jax.scene import LaneLines, RoadImage
-
-FRAME_SIZE = (720, 1280)
-"""Height and width of TuSimple's images, pixels; those of other cameras are resized to it before augmentation."""
 
 LabelSplit = Literal["train", "val", "test", "all"]
 
@@ -290,6 +287,7 @@ SOURCE = DataSource(
     load=_load,
     choose=_choose,
     title=lambda config: f"tusimple-{config.split}",
+    no_drives=NO_DRIVES,
     root="the folder with clips and label files, or with train_set and test_set",
     check=check_tusimple,
 )

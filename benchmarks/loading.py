@@ -117,8 +117,8 @@ def forms(case: Case) -> dict[tuple[str, int], Any]:
 
     Workers touch examples in memory only to augment them.
     """
-    source: Any = case.config.data.source("train")
     task: Any = case.config.task
+    source: Any = task.training_form(case.config.data.source("train"), case.config.data)
 
     def loaded(loading: StreamingConfig) -> Any:
         return task.examples(task.load(replace(source, loading=loading), progress=False))

@@ -141,3 +141,16 @@ def test_a_run_that_is_stopped_keeps_its_answers(predict, tmp_path):
     found = report(tmp_path)
     assert [record["file"] for record in found["photos"]] == [str(tmp_path / "a.png")]
     assert not found["complete"]
+
+
+def test_a_video_says_that_its_horizon_cannot_be_right(predict, tmp_path):
+    video = cv2.VideoWriter(str(tmp_path / "drive.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 5, (64, 48))
+    for _ in range(3):
+        video.write(np.zeros((48, 64, 3), np.uint8))
+    video.release()
+    (tmp_path / "drive.avi").rename(tmp_path / "drive.mp4")
+    for horizon, said in ((24.0, ""), (46.0, "distorted to 16:9: is row 46 the horizon")):
+        assert predict("drive.mp4", horizon=horizon) == 0
+        (record,) = report(tmp_path)["videos"]
+        assert said in record["warning"]
+        assert bool(record["warning"]) == bool(said)

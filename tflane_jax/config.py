@@ -37,6 +37,7 @@ from tflane_jax.models.camera_encoder import CameraEncoderConfig
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.tasks.lane_shape import LaneShapeTask
 from tflane_jax.training.loop import TrainingConfig
+from tflane_jax.training.restarts import doubling_cycles
 from tflane_jax.training.schedule import OptimConfig, warmup_fits
 
 if TYPE_CHECKING:
@@ -161,6 +162,13 @@ def with_epochs(config: RunConfig, epochs: int) -> RunConfig:
     if steps == 0:
         raise UserError("optim.epoch_steps is 0: the configuration does not say how long an epoch is")
     return dataclasses.replace(config, training=dataclasses.replace(config.training, steps=steps))
+
+
+def with_restarts(config: RunConfig, *, cycles: int = 3) -> RunConfig:
+    """Return a run with the GTN paper's Eq. (2) and the adaptive rule as its schedule, see `doubling_cycles`."""
+    optim = config.optim
+    restarts = doubling_cycles(config.training.steps, warmup_steps=optim.warmup_steps, cycles=cycles)
+    return dataclasses.replace(config, optim=dataclasses.replace(optim, drops=None, restarts=restarts))
 
 
 def _run_function(path: Path, function: str, kind: type[T]) -> T:

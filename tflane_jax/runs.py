@@ -85,7 +85,8 @@ def train_run(config: RunConfig, folder: Path | str, *, start: Start = "new", pr
 def _train(config: RunConfig, folder: Path, *, start: Start, progress: bool) -> TrainingResult:
     task = config.task
     with agreed(), stage("reading the training data"):
-        data: Any = task.load(config.data.source("train"), progress=progress)
+        source: Any = task.training_form(config.data.source("train"), config.data)
+        data: Any = task.load(source, progress=progress)
         task.check(config.data, data)
         arrays, prepare = task.examples(data), task.prepare(config.data)
         if prepare is not None:

@@ -3,14 +3,17 @@
     tflane predict --config gtn_lane/lstr --weights lstr photo.jpg
     tflane eval --config gtn_lane/lstr --weights lstr --root TUSIMPLE --split test
     tflane train --config gtn_lane/lstr --data.root TUSIMPLE --out runs/lstr
+    tflane eval runs/lstr --checkpoint last --root TUSIMPLE --split test
 
 TUSIMPLE is the folder of the dataset (docs/gtn_lane.md). On ten of its training frames the published weights give
 accuracy 0.9656, FP 0, FN 0.025, as in PyTorch.
 
 `train` follows the published recipe (docs/reference/lstr.md): from Xavier-uniform matrices, 500,000 updates of 16
 images of all three label files, Adam at 1e-4 and a tenth of it after 450,000 updates, no weight decay, clipping or
-averaging of parameters, augmentation with probability 10/11. As there, the validation frames (0531) are among the
-training frames, so that only the test set measures anything. The whole recipe was not run here.
+averaging of parameters, augmentation of full frames with probability 10/11 (what still differs:
+`datasets.augmentation`). As there, the validation frames (0531) are among the training frames, so that the best
+checkpoint is chosen on them, and only the test set measures anything: evaluate the last checkpoint. The whole recipe
+was not run here.
 """
 
 from pathlib import Path

@@ -10,6 +10,7 @@ from tflane_jax.ablations.declaration import Claim, Declaration, Declared
 from tflane_jax.ablations.effects import effects, judged_claims
 from tflane_jax.ablations.findings import findings, save_effects
 from tflane_jax.ablations.results import Results
+from tflane_jax.datasets.tusimple import SOURCE as TUSIMPLE
 
 
 @pytest.fixture(scope="module")
@@ -34,6 +35,11 @@ def test_the_report_says_what_was_declared_and_found(results, tmp_path, capsys):
     assert {row["checkpoint"] for row in rows} == {"last", "best"}
     assert [row["model"] for row in rows[:4]] == ["+TFM", "baseline", "+TFM, none", "matched"]
     assert "finding" not in rows[0]
+    assert "too narrow" not in text
+    why = TUSIMPLE.no_drives
+    path = save_effects(results, declared, "", judged_claims(results, DECLARED, ""), tmp_path / "drives", no_drives=why)
+    assert "Remark: TuSimple labels one image of each clip" in path.read_text()
+    assert "the intervals are too narrow." in path.read_text()
     late = Declared(DECLARED, SEEDS, "2026-01-01T00:00:00+00:00", 3)
     path = save_effects(results, late, "", judged_claims(results, DECLARED, ""), tmp_path / "late")
     assert "Declared when 3 runs had begun already" in path.read_text()

@@ -21,6 +21,7 @@ from tflane_jax.datasets.augmentation import (
     warp_example,
     warp_lines,
 )
+from tflane_jax.files.images import resize
 from tflane_jax.scene import LaneLines, RoadImage
 
 HEIGHT, WIDTH = 90, 160
@@ -262,4 +263,46 @@ def test_shared_read_only_masks_are_fine():
     before = example()
     shared = replace(before, image_valid=np.broadcast_to(True, (HEIGHT, WIDTH)))
     assert_same(augment(shared, ALWAYS, 4), augment(before, ALWAYS, 4))
-    assert_same(warp_example(shared, np.eye(3)).image, before.image)
+    assert_same(warp_example(shared, np.eye(3), (HEIGHT, WIDTH)).image, before.image)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Another size
+
+
+def test_the_examples_own_size_changes_no_bit():
+    before = example()
+    for seed in range(5):
+        assert_same(augment(before, ALWAYS, seed, (HEIGHT, WIDTH)), augment(before, ALWAYS, seed))
+
+
+def test_a_change_of_size_alone_is_the_usual_one():
+    before = example(height=2 * HEIGHT, width=2 * WIDTH)
+    after = augment(before, NO_AUGMENTATION, 0, (HEIGHT, WIDTH))
+    usual = resize(before.image, HEIGHT, WIDTH)
+    assert np.abs(after.image.astype(int) - usual).max() <= 1
+    assert after.image_valid.shape == (HEIGHT, WIDTH)
+    assert after.image_valid.all()
+    jax.tree.map(np.testing.assert_array_equal, after.lines, before.lines)
+
+
+def test_full_frames_are_cropped_before_they_are_resized():
+    """As in LSTR's program; resizing first would interpolate twice."""
+    config, size = replace(GEOMETRY, rotation=0.0, flip=0.0), (HEIGHT, WIDTH)
+    before = example(height=2 * HEIGHT, width=2 * WIDTH)
+    sharpness = lambda image: cv2.Laplacian(image, cv2.CV_64F).var()  # noqa: E731
+    for seed in range(4):
+        after = augment(before, config, seed, size)
+        first = augment(
+            replace(before, image=resize(before.image, *size), image_valid=np.ones(size, bool)), config, seed
+        )
+        np.testing.assert_allclose(after.lines.points, first.lines.points, atol=1e-6)
+        assert sharpness(after.image) > 1.3 * sharpness(first.image)
+        (geometry,) = np.random.default_rng(seed).spawn(1)
+        warp = draw_warp(config, geometry, 2 * HEIGHT, 2 * WIDTH)
+        left, top = -warp[:2, 2] * config.crop
+        crop = round(config.crop * 2 * HEIGHT), round(config.crop * 2 * WIDTH)
+        x, y = round(left), round(top)
+        published = resize(before.image[y : y + crop[0], x : x + crop[1]], *size)
+        # Whole pixels of the crop there, fractions here.
+        assert sharpness(after.image) == pytest.approx(sharpness(published), rel=0.4)

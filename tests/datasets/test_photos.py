@@ -1,12 +1,14 @@
 """Photographs of any size and camera are fitted to LSTR's view."""
 
+import re
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.shared import random_photo, shared_path
-from tflane_jax.datasets.photos import FOCAL, HEIGHT, HORIZON, WIDTH, PhotoCamera, Placement, fit_photo
+from tflane_jax.datasets.photos import FOCAL, HEIGHT, HORIZON, WIDTH, PhotoCamera, Placement, fit_photo, misfits
 from tflane_jax.errors import UserError
 from tflane_jax.files.images import read_image, resize
 
@@ -75,6 +77,13 @@ def test_thin_paint_survives_a_strong_reduction():
         ((600, 800), PhotoCamera(focal=float("nan")), "too short"),
         ((600, 800), PhotoCamera(horizon=600.0), "horizon, row 600, is below"),
         ((600, 800), PhotoCamera(horizon=float("nan")), "horizon"),
+        (
+            (720, 1280),
+            PhotoCamera(horizon=0.33),
+            "0.33 is a fraction: give the row in pixels, such as 238 of",
+        ),
+        ((720, 1280), PhotoCamera(horizon=1.0), "1 is a fraction"),
+        ((720, 1280), PhotoCamera(horizon=-50.0), "horizon, row -50, is above a photo 720 pixels high"),
         ((600, 800), PhotoCamera(column=-1.0), "column straight ahead, -1, is outside"),
     ],
 )
@@ -88,13 +97,14 @@ def test_numbers_in_other_units_are_refused(shape, camera, message):
     st.integers(1, 6000),
     st.integers(1, 6000),
     st.floats(0.06, 1e4),
-    st.floats(-1.0, 0.99),
+    st.floats(0.0, 0.99),
     st.floats(0, 1),
     st.booleans(),
     st.booleans(),
 )
 def test_placements_lie_in_the_photo_and_invert(height, width, focal, horizon, column, has_focal, has_horizon):
     focal, horizon = focal * width if has_focal else None, horizon * height if has_horizon else None
+    horizon = 0.0 if horizon is not None and horizon <= 1.0 else horizon
     camera = PhotoCamera(focal, horizon, column * width)
     # One row and column repeated: only the size matters here.
     seen = fit_photo(np.broadcast_to(np.zeros((1, 1, 3), np.uint8), (height, width, 3)), camera).placement
@@ -105,3 +115,20 @@ def test_placements_lie_in_the_photo_and_invert(height, width, focal, horizon, c
     np.testing.assert_allclose(seen.to_network(seen.to_photo(points)), points, atol=1e-9)
     np.testing.assert_allclose(seen.to_photo(points)[:2, 0], [seen.left, seen.left + seen.width])
     np.testing.assert_allclose(seen.to_photo(points)[:2, 1], [seen.top, seen.top + seen.height])
+
+
+@pytest.mark.parametrize(
+    ("horizon", "said"),
+    [
+        (100, ["horizon is at 0.14 of the height .* too few rows above row 100"]),
+        (700, ["sees 1280 x 30 pixels, distorted to 16:9: is row 700 the horizon"]),
+        (0, ["horizon is at 0.00"]),
+        (205, []),
+        (238, []),
+        (340, []),
+    ],
+)
+def test_a_horizon_that_cannot_be_tusimples_is_named(horizon, said):
+    found = misfits(fit_photo(random_photo(720, 1280), PhotoCamera(horizon=horizon)).placement, horizon)
+    assert len(found) == len(said)
+    assert all(re.search(pattern, text) for pattern, text in zip(said, found, strict=True))

@@ -12,6 +12,7 @@ import pytest
 
 from tests.shared import shared_path
 from tflane_jax.datasets import sources
+from tflane_jax.datasets.augmentation import AugmentationConfig
 from tflane_jax.datasets.base import TruncationWarning
 from tflane_jax.datasets.batches import batches
 from tflane_jax.datasets.lane_rows import ROWS, lane_lines, row_lanes
@@ -89,6 +90,27 @@ def test_streamed_images_are_those_in_memory(root, monkeypatch):
     assert not isinstance(loaded(root, "auto").images, Streamed)
     monkeypatch.setattr("tflane_jax.datasets.tusimple.IN_MEMORY", 1000)
     assert isinstance(loaded(root, "auto").images, Streamed)
+
+
+@pytest.mark.parametrize("where", ["memory", "disk"])
+def test_training_images_are_cut_from_full_frames(root, where):
+    """As LSTR crops, so that fine detail stays sharp; without augmentation, no full frame is read."""
+    rng = np.random.default_rng(0)
+    for path in root.rglob("*.jpg"):
+        assert cv2.imwrite(str(path), np.repeat(rng.integers(0, 256, (720, 1280, 1), np.uint8), 3, 2))
+    task, data = LaneShapeTask(), TuSimpleData(root, train="all", loading=StreamingConfig(where=where, threads=0))
+    still = AugmentationConfig(1.0, rotation=0.0, brightness=0.0, contrast=0.0, saturation=0.0, lighting=0.0)
+    data = replace(data, augmentation=still)
+    source = data.source("train")
+    small, full = (task.load(one, progress=False) for one in (source, task.training_form(source, data)))
+    ((plain,),) = batches(task.examples(small), (2,), range(1), 3)
+    ((sharp,),) = batches(task.examples(full), (2,), range(1), 3, task.prepare(data))
+    ((blurred,),) = batches(task.examples(small), (2,), range(1), 3, task.prepare(data))
+    assert sharp.image.shape == blurred.image.shape == plain.image.shape == (3, 360, 640, 3)
+    detail = lambda batch: float(np.var(np.diff(np.asarray(batch.image, float), axis=2)))  # noqa: E731
+    assert task.training_form(source, replace(data, augmentation=None)) == source
+    assert detail(sharp) > 1.3 * detail(blurred)
+    assert task.shapes(data).image.shape == sharp.image.shape[1:]
 
 
 @pytest.mark.parametrize(("damage", "said"), [("cut", "is empty: copy"), ("lost", "No such file")])

@@ -162,3 +162,12 @@ def test_mismatched_shapes_are_named(found, true, rows, message):
 def test_different_limits_do_not_merge():
     with pytest.raises(UserError, match="time limit"):
         TuSimpleMetrics().merge(TuSimpleMetrics(LSTR_TIME_LIMIT))
+
+
+def test_the_protocol_says_whether_times_were_given():
+    truth, metrics = RowLanes(upright(100), ROWS), TuSimpleMetrics()
+    metrics.update(RowLanes(upright(100)), truth)
+    assert metrics.protocol == "TuSimple, time not measured"
+    timed = TuSimpleMetrics()
+    timed.update(RowLanes(upright(100), run_time=10.0), truth)
+    assert timed.protocol == metrics.merge(timed).protocol == "TuSimple, 200 ms an image"

@@ -3,6 +3,7 @@
 import dataclasses
 from functools import cache, partial
 
+import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -275,6 +276,23 @@ def test_dropout_is_seeded():
     np.testing.assert_array_equal(run(0), run(0))
     assert float(jnp.abs(run(0) - run(1)).max()) > 0
     assert float(jnp.abs(run(0) - apply(variables, *scene(), deterministic=True)).max()) > 0
+
+
+@pytest.mark.parametrize(("name", "attends"), [("gtn", True), ("gcn", False), ("han", True)])
+def test_dropout_reaches_attention_weights(name, attends):
+    """As in the transformer's layer. The dropout that all layers have in common is left out."""
+    module, variables = built(dataclasses.replace(CONFIGS[name], layers=1))
+
+    def others_off(call, arguments, settings, context):
+        common = isinstance(context.module, nn.Dropout) and context.module.name != "weights_dropout"
+        return arguments[0] if common else call(*arguments, **settings)
+
+    with nn.intercept_methods(others_off):
+        run = lambda **how: module.apply(variables, *scene(), **how)  # noqa: E731
+        first, second = (run(deterministic=False, rngs={"dropout": jax.random.key(seed)}) for seed in range(2))
+        change = float(jnp.abs(first - run(deterministic=True)).max())
+    assert (change > 1e-3) == attends
+    assert (float(jnp.abs(first - second).max()) > 1e-3) == attends
 
 
 @pytest.mark.parametrize("name", PARAMETERS)

@@ -36,7 +36,7 @@ def test_the_edge_types_of_a_gtn_are_its_selection(tmp_path):
     written = save_edge_types(models, images, tmp_path / "edge.types")
     assert [path.name for path in written] == ["edge.types.md", "edge.types.json", "edge.types.png"]
     rows = json.loads(written[1].read_text())["rows"]
-    assert [(row["layer"], row["hop"], row["head"], row["wins"]) for row in rows] == [
+    assert [(row["layer"], row["hop"], row["channel"], row["wins"]) for row in rows] == [
         (1, 1, 1, "row"),
         (1, 1, 2, "self"),
         (1, 2, 1, "similarity"),

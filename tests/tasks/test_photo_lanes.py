@@ -97,6 +97,12 @@ def test_a_known_camera_is_not_searched(network):
         reader().read(photo(), PhotoCamera(horizon=900))
 
 
+def test_a_known_camera_that_gives_no_view_like_tusimples_is_a_warning(network):
+    assert reader().read(photo(), PhotoCamera(horizon=449)).warning == ""
+    assert "too few rows above row 100" in reader().read(photo(), PhotoCamera(horizon=100)).warning
+    assert "distorted to 16:9" in reader().read(photo(), PhotoCamera(horizon=880)).warning
+
+
 def test_the_horizon_is_searched_for_a_known_focal_length(network):
     """Without it, the photo would be seen with the horizon of TuSimple, 150 rows too high."""
     focal = FOCAL * TRUE.width

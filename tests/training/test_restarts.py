@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.test_config import configurations, shipped
 from tests.training.test_schedule import as_vectors, rates_of
 from tflane_jax.training.adaptive import AdaptiveConfig, Memory
 from tflane_jax.training.restarts import (
@@ -16,6 +17,7 @@ from tflane_jax.training.restarts import (
     adapt,
     current_cycle,
     cycle_of,
+    doubling_cycles,
     extended_cycle,
     first_cycle,
     half_cosine,
@@ -189,3 +191,45 @@ def test_cycles_are_recorded():
     changed, _, record = adapt(OPTIM.restarts, state, [memory], [{"loss": 1.5}], 100)
     assert record == {"number": [1], "length": [8], "magnitude": [0.5], "extensions": [0]}
     assert cycle_of(changed) == (6, 6, 8, 8, 0.5, 1)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The paper's cycles as shipped
+
+
+def followed(config, steps, *, warmup=0, every=None, loss=None):
+    """Return the cycles of a run as (number, start, length, magnitude), judged by loss(step) every so many steps."""
+    cycle, memories, seen = jax.device_get(first_cycle(config, warmup, steps)), [Memory()], {}
+    for step in sorted({*range(every or steps, steps + 1, every or steps), steps}):
+        while (end := int(cycle.start + cycle.length)) < step:
+            seen[int(cycle.number)] = cycle
+            cycle = jax.device_get(current_cycle(config, cycle._replace(count=np.int32(end)), steps))
+        cycle = cycle._replace(count=np.int32(step))
+        if loss is not None:
+            judged, memories, _ = adapt(config, cycle, memories, [{config.adaptive.metric: loss(step)}], steps)
+            seen[int(cycle.number)] = cycle
+            cycle = jax.device_get(judged)
+    seen[int(cycle.number)] = cycle
+    return [(number, int(c.start), int(c.length), float(c.magnitude)) for number, c in sorted(seen.items())]
+
+
+def test_doubling_cycles_fill_a_run_unless_one_is_extended():
+    config = doubling_cycles(710, warmup_steps=10)
+    assert followed(config, 710, warmup=10) == [(0, 10, 100, 1), (1, 110, 200, 1), (2, 310, 400, 1)]
+    assert len(followed(doubling_cycles(500, warmup_steps=0, cycles=5), 500)) == 5
+    # An extension of the first leaves room for two.
+    longer = followed(config, 710, warmup=10, every=20, loss=lambda step: 1.0 / step)
+    assert [number for number, *_ in longer] == [0, 1]
+
+
+@pytest.mark.parametrize("name", [name for name in shipped() if configurations()[name].optim.restarts])
+def test_a_shipped_run_with_the_rule_can_be_given_either_verdict(name):
+    config = configurations()[name]
+    training, optim = config.training, config.optim
+    run = {"warmup": optim.warmup_steps, "every": training.eval_every}
+    planned = followed(optim.restarts, training.steps, warmup=optim.warmup_steps)
+    falling = followed(optim.restarts, training.steps, **run, loss=lambda step: 1.0 / step)
+    rising = followed(optim.restarts, training.steps, **run, loss=float)
+    assert {magnitude for *_, magnitude in falling} == {1.0}
+    assert any(length > planned[number][2] for number, _, length, _ in falling)
+    assert min(magnitude for *_, magnitude in rising) < 1.0

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from tflane_jax.errors import UserError
 from tflane_jax.geometry.cameras import ground_points, project
-from tflane_jax.world.front_view.lines import ROWS, label_lines, marked_lines
+from tflane_jax.world.front_view.lines import ROW_FRACTIONS, label_lines, marked_lines
 from tflane_jax.world.front_view.road import WHITE, Stripe
 from tflane_jax.world.front_view.roadside import Roadside
 from tflane_jax.world.front_view.traffic import FrontTrafficConfig
@@ -30,7 +30,7 @@ def projected_columns(scene, number: int) -> np.ndarray:
     xy = road.at(s, np.interp(s, road.axis.s, road.lines[number]))
     pixels, _, valid = project(np.pad(xy, ((0, 0), (0, 1))), camera.intrinsics, camera.camera_from_ego, 0.8)
     pixels = pixels[valid][::-1] * SIZE / [camera.width, camera.height]
-    return np.interp(ROWS * 720.0, pixels[:, 1], pixels[:, 0], left=np.nan, right=np.nan)
+    return np.interp(ROW_FRACTIONS * 720.0, pixels[:, 1], pixels[:, 0], left=np.nan, right=np.nan)
 
 
 @settings(max_examples=25)
@@ -42,7 +42,7 @@ def test_labels_are_the_projection_of_the_lines(scene_id):
     columns = [projected_columns(scene, number) for number in marked_lines(scene.road)]
     for points, there in zip(lines.points[lines.valid], lines.point_valid[lines.valid], strict=True):
         u = points[there, 0] * 1280.0
-        np.testing.assert_allclose(points[:, 1], ROWS, rtol=1e-6)
+        np.testing.assert_allclose(points[:, 1], ROW_FRACTIONS, rtol=1e-6)
         assert ((u >= 0.0) & (u < 1280.0)).all()
         assert min(np.abs(u - c[there]).max() for c in columns if not np.isnan(c[there]).any()) < 0.5
 

@@ -27,6 +27,7 @@ from tflane_jax.ablations.results import Results
 from tflane_jax.ablations.scores import OWN_TEST, with_test_set
 from tflane_jax.ablations.workers import worker_threads
 from tflane_jax.config import RunConfig
+from tflane_jax.datasets.sources import source_of
 from tflane_jax.errors import UserError
 
 
@@ -91,7 +92,9 @@ def compare(
         if declared is not None:
             for test, suffix in suffixes(results).items():
                 tested = judged_claims(results, declared.declaration, test, first.task.errors)
-                tables.append(save_effects(results, declared, test, tested, out / f"effects{suffix}"))
+                source = source_of(with_test_set(first, tests.get(test, ())).data.source("test"))
+                stem = out / f"effects{suffix}"
+                tables.append(save_effects(results, declared, test, tested, stem, no_drives=source.no_drives))
         print("\nwritten:", *tables, *written, sep="\n  ")
     if failures:
         raise UserError(summary_of(failures, len(every)))

@@ -20,8 +20,13 @@ HAS_INTERVAL = "95 %"
 NO_INTERVAL = "no interval over scenes: decided by seeds alone"
 
 
-def save_effects(results: Results, declared: Declared, test: str, tested: Tested, stem: Path) -> Path:
-    """Print the findings and their table, save both as `<stem>.md` and `<stem>.json`, and return the first."""
+def save_effects(
+    results: Results, declared: Declared, test: str, tested: Tested, stem: Path, *, no_drives: str = ""
+) -> Path:
+    """Print the findings and their table, save both as `<stem>.md` and `<stem>.json`, and return the first.
+
+    `no_drives` is that of the test data, see `DataSource`.
+    """
     lines = [f"{results.protocol}, {results.title(test)}", "", declared.sentence()]
     seeds = min((effect.seeds for effect in tested.effects), key=len, default=())
     if seeds and set(seeds) != set(declared.seeds):
@@ -35,6 +40,8 @@ def save_effects(results: Results, declared: Declared, test: str, tested: Tested
             "p: two-sided paired t-test",
             "over seeds; Holm: corrected for all differences of one measure and checkpoint.",
         ]
+        if no_drives:
+            lines.append(f"Remark: {no_drives}: the intervals are too narrow.")
     rows, title = _rows(results, declared.declaration, test, tested.effects), "\n".join(lines)
     print("\n" + format_table(rows, title=title, digits=4))
     meta = {"declaration": asdict(declared), "protocol": results.protocol, "seeds": list(seeds)}

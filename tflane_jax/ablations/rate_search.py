@@ -1,18 +1,19 @@
 """One learning rate for each row of a table, by the same small search: `tflane tables NAME --search`.
 
-Rows are trained with each rate and one seed that the table does not have, and judged on validation data. The rates
+Rows are trained with each rate and seeds that the table does not have, and judged on validation data. The rates
 found are written into the table by hand, so that its runs do not depend on files.
 
 <out>/runs/KEY            the runs
-<out>/TABLE/rates.md, .json   validation score of each row and rate, and which rate is taken
+<out>/TABLE/rates.md, .json   validation score of each row and rate (mean over seeds), and which rate is taken
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 from tflane_jax.ablations.finished_runs import summary_of
@@ -23,6 +24,8 @@ from tflane_jax.ablations.workers import train_all, worker_threads
 from tflane_jax.errors import UserError
 from tflane_jax.plots.tables import format_table, save_table
 from tflane_jax.training.records import read_records
+
+AT_THE_EDGE = "at the edge of the grid: a wider search may find a better one"
 
 
 def search_rates(table: PaperTable, out: Path, *, jobs: int = 1, cores: int | None = None, quick: bool = False) -> Path:
@@ -43,14 +46,14 @@ def search_rates(table: PaperTable, out: Path, *, jobs: int = 1, cores: int | No
     """
     plan = plan_search(table, out, jobs=jobs, cores=cores, quick=quick)
     assert table.search is not None
-    every = [job for by_rate in plan.values() for job in by_rate.values()]
+    every = [job for by_rate in plan.values() for seeded in by_rate.values() for job in seeded]
     print(f"{table.name}: {len(every)} trainings for the learning rates of {len(plan)} rows", flush=True)
     failures = train_all(every, jobs, cores)
     rows = rated(table.search, plan)
     folder = (out / "quick" if quick else out) / table.name
     title = (
         f"{table.name}: {table.search.score} on validation data at the last step, by learning rate "
-        f"(seed {table.search.seed}{'; SMOKE TEST, no result' if quick else ''})"
+        f"({_seeds(table.search.seeds)}{'; SMOKE TEST, no result' if quick else ''})"
     )
     path, _ = save_table(folder / "rates", rows, {"table": table.name, "search": asdict(table.search)}, title=title)
     print("\n" + format_table(rows, title=title) + f"\n\nwritten to {path}: copy the rates into the table's rows")
@@ -61,8 +64,8 @@ def search_rates(table: PaperTable, out: Path, *, jobs: int = 1, cores: int | No
 
 def plan_search(
     table: PaperTable, out: Path, *, jobs: int = 1, cores: int | None = None, quick: bool = False
-) -> dict[str, dict[float, Job]]:
-    """Return the training of each row of the search and each rate.
+) -> dict[str, dict[float, list[Job]]]:
+    """Return the trainings of each row of the search and each rate, one for each seed.
 
     Raises UserError where one of them must fail. The arguments are those of `search_rates`.
     """
@@ -70,26 +73,41 @@ def plan_search(
         raise UserError(f"table {table.name} has no search for learning rates: leave --search out")
     store, threads = (out / "quick" if quick else out) / "runs", worker_threads(jobs, cores)
     chosen = [row for row in table.rows if row.name in table.search.rows]
-    plan: dict[str, dict[float, Job]] = {}
+    plan: dict[str, dict[float, list[Job]]] = {}
     for name, config in table.configs(chosen, quick=quick).items():
         by_rate = {rate: replace(config, optim=replace(config.optim, lr=rate)) for rate in table.search.rates}
         labelled = {f"{name}, rate {rate:g}": each for rate, each in by_rate.items()}
-        planned = stored_jobs(labelled, (table.search.seed,), store, threads=threads)
+        planned = stored_jobs(labelled, table.search.seeds, store, threads=threads)
         check_rows(planned)
-        plan[name] = {rate: job for rate, (job,) in zip(by_rate, planned.values(), strict=True)}
+        plan[name] = dict(zip(by_rate, planned.values(), strict=True))
     return plan
 
 
-def rated(search: RateSearch, plan: Mapping[str, Mapping[float, Job]]) -> list[dict[str, Any]]:
-    """Return for each row the score of each rate, None for one that failed, and the rate with the highest one."""
+def rated(search: RateSearch, plan: Mapping[str, Mapping[float, Sequence[Job]]]) -> list[dict[str, Any]]:
+    """Return for each row the score of each rate, the rate with the highest one, and a remark.
+
+    Scores are means over seeds, None for a rate of which a training failed. The remark says where the rate taken is the
+    smallest or largest of the grid.
+    """
     rows = []
     for name, by_rate in plan.items():
-        scores = {rate: _last_score(job, search.score) for rate, job in by_rate.items()}
+        scores = {rate: _mean(_last_score(job, search.score) for job in jobs) for rate, jobs in by_rate.items()}
         known = {rate: score for rate, score in scores.items() if score is not None}
         taken = max(known, key=lambda rate: known[rate], default=None)
         cells = {f"{rate:g}": score for rate, score in scores.items()}
-        rows.append({"row": name} | cells | {"taken": None if taken is None else f"{taken:g}"})
+        remark = AT_THE_EDGE if taken in (min(search.rates), max(search.rates)) else ""
+        rows.append({"row": name} | cells | {"taken": None if taken is None else f"{taken:g}", "remark": remark})
     return rows
+
+
+def _mean(scores: Iterable[float | None]) -> float | None:
+    """Return the mean of scores; None where one is missing."""
+    known = list(scores)
+    return None if None in known else fmean(score for score in known if score is not None)
+
+
+def _seeds(seeds: Sequence[int]) -> str:
+    return f"seed {seeds[0]}" if len(seeds) == 1 else f"mean of seeds {', '.join(map(str, seeds))}"
 
 
 def _last_score(job: Job, name: str) -> float | None:

@@ -41,6 +41,7 @@ from tflane_jax.ablations.reuse import FILE, archive_of, unused
 from tflane_jax.ablations.scores import CHECKPOINTS, OWN_TEST, code_digest, evaluations, measure
 from tflane_jax.ablations.store import TOPOLOGY
 from tflane_jax.ablations.table_plan import plan_table, seed_by_seed, store_of, tell_work
+from tflane_jax.datasets.sources import source_of
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import write_json, write_text
 from tflane_jax.files.fields import load_json
@@ -114,7 +115,8 @@ def run_table(
     first = next(iter(configs.values()))
     path = _save_scores(table, results, folder, quick=quick)
     tested = judged_claims(results, declared.declaration, OWN_TEST, first.task.errors)
-    save_effects(results, declared, OWN_TEST, tested, folder / "effects")
+    no_drives = source_of(first.data.source("test")).no_drives
+    save_effects(results, declared, OWN_TEST, tested, folder / "effects", no_drives=no_drives)
     pair = (table.claims[0].control or table.rows[0].name, table.claims[0].treatment)
     models = first_models(trained, results)
     if {results.owners.get(row, row) for row in pair} <= models.keys():  # recorded runs have no parameters

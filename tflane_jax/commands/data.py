@@ -73,7 +73,9 @@ def _show_images(source: Any, config: RunConfig, options: argparse.Namespace) ->
     examples = stack_examples([dataset.example(index) for index in indices])
     columns = {"images": examples}
     if (prepare := config.task.prepare(config.data)) is not None:
-        columns["augmented"] = prepared(examples, prepare, 0, 0)
+        larger = sources.make_dataset(config.task.training_form(source, config.data))
+        taken = stack_examples([larger.example(index) for index in indices])
+        columns["augmented"] = prepared(taken, prepare, 0, 0)
     for name, shown in columns.items():
         path = options.out if name == "images" else options.out.with_stem(f"{options.out.stem}-{name}")
         print(f"{name} written to {save_road_images(path, shown, titles=[f'image {index}' for index in indices])}")

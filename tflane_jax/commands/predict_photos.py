@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from tflane_jax.commands.sources import make_folder
-from tflane_jax.datasets.photos import PhotoCamera, Placement, fit_photo
+from tflane_jax.datasets.photos import PhotoCamera, Placement, fit_photo, misfits
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import write_json
 from tflane_jax.files.images import PHOTO_SUFFIXES, list_photos, opencv, read_image
@@ -125,20 +125,23 @@ def _video(reader: PhotoReader, path: Path, out: Path, camera: PhotoCamera | Non
     """Write the video with its lanes; all frames are seen in one view, because they have one camera."""
     info = video_info(path)
     some = sample_frames(path, _SEARCHED_FRAMES)
-    known = camera is not None and camera.horizon is not None
+    horizon = None if camera is None else camera.horizon
+    known = horizon is not None
     view = fit_photo(some[0], camera).placement if known else reader.find_view(some, camera and camera.focal)
     head = {"file": str(path), "width": info.width, "height": info.height, "rate": info.rate}
     if view is None:
         warning = "no view of its frames shows plausible lanes, and no video is written: give --horizon and --focal"
         return head | {"video": None, "view": None, "warning": warning, "frames": []}
     frames, doubtful = [], 0
+    of_all = "; ".join(misfits(view, horizon)) if known else ""
     with writing_video(out, info) as writer:
         for frame in progress_bar(read_frames(path), desc=path.name, unit="frame", total=info.frames or None):
             answer = reader.read(frame, camera) if known else reader.read_view(frame, view)
             writer.add(lanes_drawn(frame, answer.lanes))
             frames.append(_plain(answer, _VIDEO_POINTS))
-            doubtful += bool(answer.warning)
+            doubtful += answer.warning not in ("", of_all)
     warning = f"{doubtful} of {len(frames)} frames are doubtful or empty" if doubtful else ""
+    warning = "; ".join(filter(None, (of_all, warning)))
     return head | {"video": out.name, "view": _plain_view(view), "warning": warning, "frames": frames}
 
 

@@ -117,7 +117,7 @@ def _check_together(options: argparse.Namespace) -> None:
         raise UserError(f"--quick runs are no results and never recorded: leave out {idle[0]} or --quick")
     of_runs = ("--seeds", "--record", "--from", "--earlier-scores")
     if options.search and (idle := [name for name in names if name in of_runs]):
-        raise UserError(f"--search trains other runs than the table's, with its own seed: leave out {idle[0]}")
+        raise UserError(f"--search trains other runs than the table's, with its own seeds: leave out {idle[0]}")
 
 
 def _listed(name: str) -> dict[str, str | int | float]:

@@ -1,8 +1,10 @@
 """Random augmentation of road images: geometry, colour and lighting, by default LSTR's recipe.
 
-Runs on the host with numpy and OpenCV: all geometry is one affine warp, all colour one affine map of RGB. The content
-of padding never reaches the result; pixels that the warp does not cover are black and invalid. Source: the training
-settings of LSTR, https://github.com/liuruijin17/LSTR.
+Runs on the host with numpy and OpenCV: all geometry, with a change of size, is one affine warp, all colour one affine
+map of RGB. The content of padding never reaches the result; pixels that the warp does not cover are black and invalid.
+Source: the training settings of LSTR, https://github.com/liuruijin17/LSTR. It rotates and crops the full frame, then
+resizes it. What still differs: colours are clipped to 0 to 255, and a line ends at its last labelled point in the
+image, where LSTR's imgaug adds a point at the border.
 """
 
 from __future__ import annotations
@@ -59,7 +61,9 @@ class AugmentationConfig:
     lighting: PositiveOrZero = 0.1
 
 
-def augment(example: RoadImage, config: AugmentationConfig, seed: Seed) -> RoadImage:
+def augment(
+    example: RoadImage, config: AugmentationConfig, seed: Seed, size: tuple[int, int] | None = None
+) -> RoadImage:
     """Return one example with random changes; the same seed gives the same bits.
 
     Points that leave the image become invalid. Rows stay ascending within a line, and lines stay sorted from left to
@@ -69,12 +73,14 @@ def augment(example: RoadImage, config: AugmentationConfig, seed: Seed) -> RoadI
         example: numpy.
         config: strength of the changes.
         seed: an integer or several, such as (run seed, epoch, index).
+        size: height and width of the result, pixels; None for those of the example. Give examples at the size of the
+            camera, not resized before: a second interpolation blurs.
     """
     geometry, colour = np.random.default_rng(seed).spawn(2)
-    height, width = example.image_valid.shape
-    warp = draw_warp(config, geometry, height, width)
-    if warp is not None:
-        example = warp_example(example, warp)
+    given = example.image_valid.shape
+    warp = draw_warp(config, geometry, *given)
+    if warp is not None or size not in (None, given):
+        example = warp_example(example, warp, given if size is None else size)
     factors, order = _draw_jitter(config, colour)
     light = PCA_VECTORS @ (PCA_VALUES * colour.normal(scale=config.lighting, size=3))
     if not (factors == 1.0).all() or light.any():
@@ -104,22 +110,24 @@ def draw_warp(
     return None if (warp == np.eye(3)).all() else warp
 
 
-def warp_example(example: RoadImage, warp: Float[np.ndarray, "3 3"]) -> RoadImage:
-    """Return an example under an affine map as `draw_warp` gives it (bilinear; padding is black)."""
+def warp_example(example: RoadImage, warp: Float[np.ndarray, "3 3"] | None, size: tuple[int, int]) -> RoadImage:
+    """Return an example under an affine map as `draw_warp` gives it, at another size (bilinear; padding is black)."""
     cv2 = opencv()
     height, width = example.image_valid.shape
+    lines = example.lines if warp is None else warp_lines(example.lines, warp, height, width)
+    resized = np.diag([size[1] / width, size[0] / height, 1.0]) @ (np.eye(3) if warp is None else warp)
     # OpenCV counts from the centre of the first pixel, and reads the map from the new image to the old.
     half = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])
-    inverse = (np.linalg.inv(half) @ np.linalg.inv(warp) @ half)[:2]
+    inverse = (np.linalg.inv(half) @ np.linalg.inv(resized) @ half)[:2]
     seen = np.asarray(example.image_valid, np.uint8)
     image = np.ascontiguousarray(example.image)
     if not seen.all():
         image = cv2.bitwise_and(image, image, mask=seen)
-    size, flags = (width, height), cv2.WARP_INVERSE_MAP
-    image = cv2.warpAffine(image, inverse, size, flags=flags | cv2.INTER_LINEAR)
-    seen = cv2.warpAffine(seen, inverse, size, flags=flags | cv2.INTER_NEAREST)
+    columns_rows, flags = size[::-1], cv2.WARP_INVERSE_MAP
+    image = cv2.warpAffine(image, inverse, columns_rows, flags=flags | cv2.INTER_LINEAR)
+    seen = cv2.warpAffine(seen, inverse, columns_rows, flags=flags | cv2.INTER_NEAREST)
     image = cv2.bitwise_and(image, image, mask=seen)
-    return RoadImage(image, seen.astype(bool), warp_lines(example.lines, warp, height, width))
+    return RoadImage(image, seen.astype(bool), lines)
 
 
 def warp_lines(lines: LaneLines, warp: Float[np.ndarray, "3 3"], height: int, width: int) -> LaneLines:

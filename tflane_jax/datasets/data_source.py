@@ -103,6 +103,8 @@ class DataSource(Generic[ConfigT]):
         views: (config, numbers) -> images of these examples for pictures, where examples have none; None for an
             example whose images are not there.
         interval: config -> seconds between successive examples of a scene; None where they are not known without data.
+        no_drives: why a scene of an evaluation is no whole drive, so that intervals over scenes are too narrow; "" if
+            they are not.
         cameras: config -> names of the cameras whose images are read from files, in order; None for no such images.
     """
 
@@ -125,6 +127,7 @@ class DataSource(Generic[ConfigT]):
     tracks: bool = False
     views: Callable[[ConfigT, Sequence[int]], list[CameraViews | None]] | None = None
     interval: Callable[[ConfigT], float | None] = lambda config: None
+    no_drives: str = ""
     cameras: Callable[[ConfigT], tuple[str, ...] | None] = lambda config: None
 
 

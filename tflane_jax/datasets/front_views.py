@@ -24,7 +24,7 @@ from tflane_jax.errors import UserError
 from tflane_jax.files.tusimple import RowLanes
 from tflane_jax.limits import Count
 from tflane_jax.scene import LaneLines, RoadImage
-from tflane_jax.world.front_view.lines import CAPACITY, ROWS
+from tflane_jax.world.front_view.lines import CAPACITY, ROW_FRACTIONS
 from tflane_jax.world.front_view.views import FrontWorldConfig, front_view
 
 
@@ -113,7 +113,10 @@ def load_road_images(config: FrontViewConfig, *, progress: bool = True, workers:
     if count:
         stored = image_from_leaves(cached(dataset, progress=progress, workers=workers).arrays(mapped=True))
     else:
-        points, flags = np.zeros((0, CAPACITY, len(ROWS), 2), np.float32), np.zeros((0, CAPACITY, len(ROWS)), bool)
+        points, flags = (
+            np.zeros((0, CAPACITY, len(ROW_FRACTIONS), 2), np.float32),
+            np.zeros((0, CAPACITY, len(ROW_FRACTIONS)), bool),
+        )
         lines = LaneLines(points, flags, np.zeros((0, CAPACITY), bool))
         stored = RoadImage(image=np.zeros((*shape, 3), np.uint8), image_valid=None, lines=lines)  # type: ignore
     return replace(stored, image_valid=np.broadcast_to(True, shape))

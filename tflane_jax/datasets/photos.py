@@ -20,8 +20,12 @@ HORIZON = 0.331
 # Assumed, not measured: 714 pixels of 1280, the calibration of TuSimple's velocity benchmark as others quote it.
 # TuSimple publishes none for its lane images, and the labels do not determine it: flat straight lanes look alike at
 # every focal length, and the dashes in the ten frames at hand are too faint to measure their period.
+# The built-in world's front views are drawn with 900 to 1100 pixels (`world.render.camera`), which was not measured
+# either.
 FOCAL = 714.15 / 1280
 
+# How far off the horizon of a view may be, of its height, and its aspect, a factor: 4:3 and 21:9 pass.
+_LEVEL, _ALIKE = 0.05, 1.5
 # If TuSimple's view is a smaller fraction of the photo's width than this, the focal length is in wrong units.
 _LEAST_SEEN = 0.1
 
@@ -77,8 +81,9 @@ def fit_photo(image: UInt8[np.ndarray, "h w 3"], camera: PhotoCamera | Placement
     """Return the network's view of a photo of any size: what a camera tells, or a part of the photo.
 
     Without a camera the whole photo is stretched to the network's size, as by the reference. A known camera removes
-    what TuSimple's camera would not have seen. A horizon cuts rows off the top until it has TuSimple's height; a focal
-    length shorter than TuSimple's cuts the sides and, with a horizon, the bottom.
+    what TuSimple's camera would not have seen. A horizon cuts rows off the top until it has TuSimple's height, where
+    the photo has enough rows above it; `misfits` says where not. A focal length shorter than TuSimple's cuts the sides
+    and, with a horizon, the bottom.
 
     Nothing is padded and the aspect is not kept. With the published LSTR weights on TuSimple frames cut to other shapes
     (ten frames, all seen in training), padding and cutting to 16:9 did worse than stretching in most shapes (1280 x 540
@@ -119,11 +124,37 @@ def _seen(height: int, width: int, camera: PhotoCamera) -> Placement:
 
     top, bottom = 0, height
     if camera.horizon is not None:
-        if not camera.horizon < height:
-            raise UserError(f"the horizon, row {camera.horizon:g}, is below a photo {height} pixels high")
+        if 0.0 < camera.horizon <= 1.0:
+            raise UserError(
+                f"a horizon of {camera.horizon:g} is a fraction: give the row in pixels, such as "
+                f"{camera.horizon * height:.0f} of a photo {height} pixels high"
+            )
+        if not 0.0 <= camera.horizon < height:
+            side = "above" if camera.horizon < 0.0 else "below"
+            raise UserError(f"the horizon, row {camera.horizon:g}, is {side} a photo {height} pixels high")
         if camera.focal is not None:
             below = (1.0 - HORIZON) * columns * HEIGHT / WIDTH  # rows that TuSimple's camera sees under its horizon
             bottom = round(min(max(camera.horizon + below, 1), height))
         top = round(max(camera.horizon - HORIZON / (1.0 - HORIZON) * (bottom - camera.horizon), 0))
         top = min(top, bottom - 1)
     return Placement(left, top, across, bottom - top)
+
+
+def is_alike(width: int, height: int) -> bool:
+    """Return whether an image has about TuSimple's aspect, 16:9; in squares and portraits all lanes are distorted."""
+    return 1.0 / _ALIKE <= width * HEIGHT / (height * WIDTH) <= _ALIKE
+
+
+def misfits(view: Placement, horizon: float) -> list[str]:
+    """Return what makes a view with a known horizon (row of the photo) unlike TuSimple's; empty if nothing does."""
+    found, at = [], (horizon - view.top) / view.height
+    if abs(at - HORIZON) > _LEVEL:
+        found.append(
+            f"the horizon is at {at:.2f} of the height that the network sees, in its training images at {HORIZON:.2f}: "
+            f"the photo has too few rows above row {horizon:g}"
+        )
+    if not is_alike(view.width, view.height):
+        found.append(
+            f"the network sees {view.width} x {view.height} pixels, distorted to 16:9: is row {horizon:g} the horizon?"
+        )
+    return found

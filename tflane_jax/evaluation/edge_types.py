@@ -35,14 +35,14 @@ class EdgeTypes:
     layers: tuple[Float[np.ndarray, "hops channels types"], ...]
 
     def rows(self) -> Iterator[dict[str, Any]]:
-        """Yield a row of a table for each hop of each meta-path; layers, hops and heads count from 1."""
+        """Yield a row of a table for each hop of each meta-path (channel); layers, hops and channels count from 1."""
         for layer, by_hop in enumerate(self.layers, 1):
             for hop, by_channel in enumerate(by_hop, 1):
                 for channel, weights in enumerate(by_channel, 1):
                     place = {
                         "layer": layer,
                         "hop": hop,
-                        "head": channel,
+                        "channel": channel,
                         "wins": self.names[int(np.nanargmax(weights))],
                     }
                     shown = {name: float(w) for name, w in zip(self.names, weights, strict=True) if np.isfinite(w)}

@@ -24,6 +24,8 @@ from flax import linen as nn
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from tflane_jax.layers.attention import Drop
+
 Relation = Literal[
     "self", "up", "down", "left", "right", "up_left", "up_right", "down_left", "down_right", "row", "column"
 ]
@@ -180,6 +182,7 @@ def attend_near(
     source: Float[Array, "h w heads"],
     value: Float[Array, "h w heads d"],
     valid: Bool[Array, "h w"],
+    drop: Drop = None,
 ) -> tuple[Float[Array, "h w heads d"], Float[Array, "9 h w heads"]]:
     """Attend to the cell and its 8 neighbours; see `attend_along`. Weights: the cell itself first, then `SIDES`."""
     sides = [(0, 0), *SIDES.values()]
@@ -187,7 +190,8 @@ def attend_near(
     scores = jnp.stack([_score(destination, near) for near in neighbours(tuple(sides), source)])
     weights = _softmax(scores, is_source, 0)
     near = neighbours(tuple(sides), value)
-    parts = (w[..., None] * v for w, v in zip(weights, near, strict=True))
+    used = weights if drop is None else drop(weights)
+    parts = (w[..., None] * v for w, v in zip(used, near, strict=True))
     return sum(parts, jnp.zeros_like(value)), weights
 
 
@@ -197,6 +201,7 @@ def attend_along(
     source: Float[Array, "h w heads"],
     value: Float[Array, "h w heads d"],
     valid: Bool[Array, "h w"],
+    drop: Drop = None,
 ) -> tuple[Float[Array, "h w heads d"], Float[Array, "lines n n heads"]]:
     """Attend to the valid cells of the same row (axis 1) or column (axis 0) by GAT's scores (Wang et al. 2019, Eq. 3).
 
@@ -205,14 +210,15 @@ def attend_along(
         destination, source: scores of a cell i and of its neighbour j, the two halves of a^T [h_i || h_j].
         value: finite everywhere.
         valid: cells that may be attended to.
+        drop: dropout of the weights.
 
     Returns:
-        The attended values, and the weights by (line, destination cell, source cell, head).
+        The attended values, and the weights before dropout by (line, destination cell, source cell, head).
     """
     if axis == 0:
         destination, source, value, valid = (x.swapaxes(0, 1) for x in (destination, source, value, valid))
     weights = _softmax(_score(destination[:, :, None], source[:, None]), valid[:, None, :, None], 2)
-    out = jnp.einsum("lijh,ljhd->lihd", weights, value)
+    out = jnp.einsum("lijh,ljhd->lihd", weights if drop is None else drop(weights), value)
     return (out.swapaxes(0, 1) if axis == 0 else out), weights
 
 

@@ -31,8 +31,8 @@ class LaneShapeLossConfig:
         cell_weight: weight of the auxiliary loss on cells, for networks that have it; LSTR does not.
         shared_horizon: the target of every lane begins at the highest row of all lanes in the image, as in LSTR.
         least_depth: rows nearer to the predicted horizon than this fraction of the image height, above or below it,
-            are evaluated this far below it. The curve has a pole at the horizon; with LSTR's 1e-6, training rarely
-            recovers from a predicted horizon close to a point's row.
+            are evaluated this far below it. The curve has a pole at the horizon; with the default 1e-6 (LSTR's program
+            has no bound), training rarely recovers from a predicted horizon close to a point's row.
         matcher: backend of `matching.match`.
     """
 

@@ -30,30 +30,33 @@ class TuSimpleMetrics:
 
     Args:
         time_limit: milliseconds; an image that took longer counts as missed. 200 officially, 20,000 in LSTR's copy.
+            Detections without a time (`run_time` 0) are never late.
     """
 
     def __init__(self, time_limit: float = OFFICIAL_TIME_LIMIT) -> None:
         self.time_limit = time_limit
-        self._frames = 0
+        self._frames = self._timed = 0
         self._sums = np.zeros(3)
         self._images: list[tuple[float, float, float]] = []
 
     @property
     def protocol(self) -> str:
-        """Name and version, the title of every table of these numbers."""
-        return f"TuSimple, {self.time_limit:g} ms an image"
+        """Name and version, the title of every table of these numbers; whether the time limit was applied."""
+        return f"TuSimple, {self.time_limit:g} ms an image" if self._timed else "TuSimple, time not measured"
 
     def update(self, detections: RowLanes, truth: RowLanes) -> None:
         """Add one image; raise UserError for arrays that do not fit together."""
         self._images.append(score_image(detections, truth, self.time_limit))
         self._sums += self._images[-1]
         self._frames += 1
+        self._timed += detections.run_time > 0.0
 
     def merge(self, *others: Self) -> Self:
         """Return an accumulator of the images of all, in this order (none changes)."""
         for other in others:
             if self.time_limit != other.time_limit:
-                raise UserError(f"cannot merge {self.protocol} with {other.protocol}: use one time limit")
+                limits = f"{self.time_limit:g} and {other.time_limit:g} ms"
+                raise UserError(f"cannot merge scores of TuSimple with limits of {limits} an image: use one time limit")
         merged = type(self)(self.time_limit)
         for name in vars(self).keys() - {"time_limit"}:
             setattr(merged, name, joined([getattr(each, name) for each in (self, *others)]))

@@ -8,9 +8,9 @@ learned meta-paths replaces self-attention. The nodes are the cells of the featu
 
 Self-attention is one of the GTN's edge types, called similarity: its adjacency comes from the query and key projections
 of features + position, and the value and output projections are the weights of the graph convolution on all meta-paths.
-GNN and transformer thus share their parameters; the GTN adds only the selection weights, hops * channels * edge types.
-With equal numbers of heads, a layer that selects similarity in one hop and `self` in all others is exactly the
-transformer's encoder layer.
+GNN and transformer thus share their parameters. With LSTR's two heads the GTN adds only the selection weights, hops *
+channels * edge types, and a layer that selects similarity in one hop and `self` in all others is exactly the
+transformer's encoder layer, dropout included. With one head, the default, queries and keys are half as wide.
 
 A layer costs about as much as the transformer's: products of adjacencies are never formed (FastGTN), the other edge
 types are shifts and means, and similarity, with one head for all channels, is offered to the last hop only.
@@ -27,7 +27,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from tflane_jax.errors import UserError
-from tflane_jax.layers.attention import attention_probabilities, masked_attention
+from tflane_jax.layers.attention import Drop, attention_probabilities, masked_attention
 from tflane_jax.layers.graph_transformer import propagate
 from tflane_jax.layers.image_graph import (
     AXES,
@@ -57,7 +57,7 @@ class GtnEncoderConfig:
         heads: of similarity; one head for all channels is cheapest.
         head_dim: channels of query and key of a head, as in LSTR's attention.
         hidden: hidden channels of the feed-forward network.
-        dropout: probability for hidden channels and each residual branch.
+        dropout: probability for attention weights, hidden channels and each residual branch.
     """
 
     layers: Count = 2
@@ -140,7 +140,7 @@ class HanEncoderConfig:
             is composed of two edges, of which the first one acts first.
         semantic: channels of semantic-level attention.
         hidden: hidden channels of the feed-forward network.
-        dropout: probability for hidden channels and each residual branch.
+        dropout: probability for attention weights, hidden channels and each residual branch.
     """
 
     layers: Count = 2
@@ -223,7 +223,9 @@ class GraphEncoderLayer(nn.Module):
         def drop(name, x):
             return nn.Dropout(config.dropout, name=name)(x, deterministic=deterministic)
 
-        mixed = config.mixing("graph")(x, position, valid)
+        drops = config.dropout > 0 and not deterministic
+        drop_weights = nn.Dropout(config.dropout, deterministic=False, name="weights_dropout") if drops else None
+        mixed = config.mixing("graph")(x, position, valid, drop_weights)
         x = nn.LayerNorm(epsilon=1e-5, name="graph_norm")(x + drop("graph_dropout", mixed))
         hidden = drop("hidden_dropout", nn.relu(nn.Dense(config.hidden, name="expand")(x)))
         fed = nn.Dense(x.shape[-1], name="contract")(hidden)
@@ -237,7 +239,7 @@ class MetaPathConvolution(nn.Module):
 
     @nn.compact
     def __call__(
-        self, x: Float[Array, "h w c"], position: Float[Array, "h w c"], valid: Bool[Array, "h w"]
+        self, x: Float[Array, "h w c"], position: Float[Array, "h w c"], valid: Bool[Array, "h w"], drop: Drop = None
     ) -> Float[Array, "h w c"]:
         """Return the change of x, without the residual."""
         config, dim = self.config, x.shape[-1]
@@ -260,7 +262,7 @@ class MetaPathConvolution(nn.Module):
                 return mixed
             here, _ = bordered_sides(config.relations, h, valid)
             here = _by_head(here.astype(query.dtype), config.heads)
-            similar = masked_attention(query, key, here, mask).swapaxes(0, 1).reshape(h.shape)
+            similar = masked_attention(query, key, here, mask, drop).swapaxes(0, 1).reshape(h.shape)
             # Invalid cells are queries too; their result must not enter a further hop.
             return mixed + type_weights[structural][None, None] * jnp.where(valid[..., None], similar, 0.0)
 
@@ -278,10 +280,10 @@ class NeighbourConvolution(nn.Module):
 
     @nn.compact
     def __call__(
-        self, x: Float[Array, "h w c"], position: Float[Array, "h w c"], valid: Bool[Array, "h w"]
+        self, x: Float[Array, "h w c"], position: Float[Array, "h w c"], valid: Bool[Array, "h w"], drop: Drop = None
     ) -> Float[Array, "h w c"]:
         """Return the change of x, without the residual."""
-        del position
+        del position, drop
         if self.is_mutable_collection("intermediates"):
             self.sow("intermediates", "relations", jnp.ones((1, 1, 1), x.dtype))
         return nn.relu(smooth(full(nn.Dense(x.shape[-1], name="value")(x)), valid))
@@ -298,7 +300,7 @@ class HeterogeneousAttention(nn.Module):
 
     @nn.compact
     def __call__(
-        self, x: Float[Array, "h w c"], position: Float[Array, "h w c"], valid: Bool[Array, "h w"]
+        self, x: Float[Array, "h w c"], position: Float[Array, "h w c"], valid: Bool[Array, "h w"], drop: Drop = None
     ) -> Float[Array, "h w c"]:
         """Return the change of x, without the residual."""
         config, (height, width, dim) = self.config, x.shape
@@ -308,7 +310,7 @@ class HeterogeneousAttention(nn.Module):
         placed = (x + position).reshape(height * width, dim)
         paths = [relation.split("+") for relation in config.relations]
         edges = sum(map(len, paths))
-        # a^T [W h_i || W h_j] of every edge and head in one product (Eq. 2-3).
+        # Scores are linear in features + position; HAN's, a^T [W h_i || W h_j] (Eq. 3), in the projected features.
         halves = nn.Dense(2 * edges * config.heads, use_bias=False, name="scores")(placed)
         scores = iter(jnp.moveaxis(full(halves).reshape(height, width, edges, 2, config.heads), (2, 3), (0, 1)))
         by_type = []
@@ -317,9 +319,9 @@ class HeterogeneousAttention(nn.Module):
             for edge in path:
                 destination, source = next(scores)
                 if edge == "near":
-                    out, weights = attend_near(destination, source, out, valid)
+                    out, weights = attend_near(destination, source, out, valid, drop)
                 else:
-                    out, weights = attend_along(AXES[edge], destination, source, out, valid)
+                    out, weights = attend_along(AXES[edge], destination, source, out, valid, drop)
                 if self.is_mutable_collection("intermediates"):
                     self.sow("intermediates", f"{relation}_probabilities", weights)
             by_type.append(nn.elu(out.reshape(height, width, dim)))  # Eq. (4)

@@ -1,4 +1,4 @@
-"""Weights of edge types as a picture: a row for each hop of each meta-path, a column for each edge type."""
+"""Weights of edge types as a picture: a row for each hop of each meta-path (channel), a column for each edge type."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def save_edge_types(path: Path, found: Mapping[str, EdgeTypes]) -> Path:
         weights = np.concatenate([layer.reshape(-1, len(one.names)) for layer in one.layers])
         several = any(layer.shape[:2] != (1, 1) for layer in one.layers)
         labels = [
-            f"layer {row['layer']}" + (f", hop {row['hop']}, head {row['head']}" if several else "")
+            f"layer {row['layer']}" + (f", hop {row['hop']}, channel {row['channel']}" if several else "")
             for row in one.rows()
         ]
         ax.imshow(weights, cmap="Blues", vmin=0.0, vmax=1.0, aspect="auto")

@@ -135,7 +135,7 @@ def _tusimple(time_limit: float) -> ScoringProtocol:
         read_predictions=tusimple.read_predictions,
         read_truth=tusimple.read_truth,
         scene_of=lambda image: image.rpartition("/")[0],
-        no_scenes="TuSimple labels one image of each clip, and clips of one drive are drawn as if they were apart",
+        no_scenes=tusimple.NO_DRIVES,
         metrics=partial(TuSimpleMetrics, time_limit),
         columns=("Accuracy", "FP", "FN"),
         formats=("TuSimple",),

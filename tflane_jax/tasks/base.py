@@ -124,6 +124,10 @@ class Task(Generic[ExampleT, DataT, SourceT, MemoryT]):
         """Return a split, in memory or as a `Streamed` that reads examples on demand."""
         raise NotImplementedError
 
+    def training_form(self, source: SourceT, data: SplitData) -> SourceT:
+        """Return a split of which `load` gives the examples that `prepare` takes."""
+        return source
+
     def examples(self, data: DataT) -> ExampleT | Streamed:
         """Return the training examples of a split, as `datasets.batches` takes them."""
         raise NotImplementedError

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
@@ -23,7 +23,7 @@ from tflane_jax.datasets.lane_rows import LabelledImages
 from tflane_jax.datasets.photos import HEIGHT as INPUT_HEIGHT
 from tflane_jax.datasets.photos import WIDTH as INPUT_WIDTH
 from tflane_jax.datasets.streaming import Prepare, Streamed
-from tflane_jax.datasets.tusimple import TuSimpleConfig
+from tflane_jax.datasets.tusimple import TuSimpleConfig, TuSimpleData
 from tflane_jax.evaluation import lane_shapes
 from tflane_jax.evaluation.by_scene import summed_ratio
 from tflane_jax.evaluation.predict import (
@@ -36,7 +36,7 @@ from tflane_jax.evaluation.predict import (
     predictions,
 )
 from tflane_jax.evaluation.results import Evaluation, EvaluationConfig
-from tflane_jax.files.tusimple import RowLanes
+from tflane_jax.files.tusimple import SIZE, RowLanes
 from tflane_jax.layers.batch_norm import BATCH_AXIS, STATISTICS
 from tflane_jax.limits import SettingError
 from tflane_jax.losses.lane_shape import LaneShapeLossConfig, lane_shape_loss, lane_shape_targets
@@ -48,7 +48,7 @@ from tflane_jax.models.parameters import Params, joined_statistics, split_statis
 from tflane_jax.scene import CurvePrediction, LaneLines, Prediction, RoadImage, shapes_of, stack_examples
 from tflane_jax.tasks.base import Draw, Model, Recorded, Task, spread
 from tflane_jax.tasks.edge_types import save_edge_types
-from tflane_jax.world.front_view.lines import CAPACITY, ROWS
+from tflane_jax.world.front_view.lines import CAPACITY, ROW_FRACTIONS
 
 _COMPARED_EXAMPLES = 6
 _TIMED_FRAMES = 30
@@ -124,13 +124,22 @@ class LaneShapeTask(Task[RoadImage, LabelledImages, ImageSource, None]):
         """Return the images of a source, in memory or streamed, with their labels."""
         return sources.load(source, progress=progress)
 
+    def training_form(self, source: ImageSource, data: SplitData) -> ImageSource:
+        """Return a split with full frames of TuSimple where they are augmented: one warp crops and resizes them.
+
+        Images of other cameras are resized to TuSimple's size before.
+        """
+        if isinstance(source, TuSimpleConfig) and _cropped(data):
+            return replace(source, height=SIZE[0], width=SIZE[1])
+        return source
+
     def examples(self, data: LabelledImages) -> RoadImage | Streamed:
         """Return the images with their lane lines."""
         return data.images
 
     def shapes(self, data: SplitData) -> RoadImage:
         """Return shapes of images at the network's resolution."""
-        lines = LaneLines.empty(CAPACITY, len(ROWS))
+        lines = LaneLines.empty(CAPACITY, len(ROW_FRACTIONS))
         size = (INPUT_HEIGHT, INPUT_WIDTH)
         return shapes_of(RoadImage(np.zeros((*size, 3), np.uint8), np.zeros(size, bool), lines))
 
@@ -146,9 +155,10 @@ class LaneShapeTask(Task[RoadImage, LabelledImages, ImageSource, None]):
         augmentation = getattr(data, "augmentation", None)
         if augmentation is None:
             return None
+        size = (INPUT_HEIGHT, INPUT_WIDTH) if _cropped(data) else None
 
         def prepare(example: RoadImage, key: tuple[int, int, int]) -> RoadImage:
-            return augment(example, augmentation, key)
+            return augment(example, augmentation, key, size)
 
         return prepare
 
@@ -221,6 +231,11 @@ class LaneShapeTask(Task[RoadImage, LabelledImages, ImageSource, None]):
             }
             for name, fps, accuracy, fp, fn in GTN_TABLE_1
         ]
+
+
+def _cropped(data: SplitData) -> bool:
+    """Return whether augmentation takes full frames, larger than the network's input."""
+    return isinstance(data, TuSimpleData) and data.augmentation is not None
 
 
 def found_lanes(prediction: CurvePrediction, truth: RowLanes, threshold: float | None = None) -> RowLanes:

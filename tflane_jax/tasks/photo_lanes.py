@@ -14,7 +14,7 @@ import jax
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from tflane_jax.datasets.photos import FOCAL, HORIZON, PhotoCamera, Placement, fit_photo
+from tflane_jax.datasets.photos import FOCAL, HORIZON, PhotoCamera, Placement, fit_photo, is_alike, misfits
 from tflane_jax.evaluation.photo_lanes import Judgement, common_horizon, is_blank, judge_lanes, without_crossings
 from tflane_jax.evaluation.predict import Predictor
 from tflane_jax.files.images import opencv
@@ -30,9 +30,6 @@ _FINE_WIDTHS = (1.0, 0.85, 0.7, 0.55)
 # The value from which a whole photo is taken without a search (TuSimple's ten frames at hand have 0.23 up), and the
 # ranks from which a view is taken without a warning, and taken at all.
 _SURE, _PLAUSIBLE, _LEAST = 0.2, 0.15, 0.05
-# Largest ratio between a photo's aspect and TuSimple's 16:9 at which the whole photo may be taken without a search: 4:3
-# and 21:9 pass; in squares and portraits all lanes would be distorted.
-_ALIKE = 1.5
 _POINTS = 100
 _EMPTY = "the photo is empty: it has one brightness almost everywhere"
 _NOTHING = (
@@ -126,7 +123,7 @@ class PhotoReader:
     ) -> _ViewLanes:
         height, width = grey.shape
         whole = self._of_camera(photo, grey, PhotoCamera(focal))
-        if whole.judged.value >= _SURE and 1.0 / _ALIKE < width * 9 / (height * 16) < _ALIKE:
+        if whole.judged.value >= _SURE and is_alike(width, height):
             return whole
         tried = {whole.view: whole}
         for horizon in _HORIZONS:
@@ -143,6 +140,8 @@ class PhotoReader:
         return max(tried.values(), key=lambda seen: seen.judged.rank)
 
     def _try(self, tried: dict[Placement, _ViewLanes], photo, grey, camera: PhotoCamera) -> None:
+        if camera.horizon is not None and camera.horizon <= 1.0:
+            return  # at the upper border of the photo
         view = fit_photo(photo, camera).placement
         if view not in tried:
             tried[view] = self._in_view(photo, grey, view)
@@ -193,7 +192,7 @@ class PhotoReader:
                 worth.append(float(seen.scores[i]) + judged.paint[i])
                 kept.append(i)
         clear = without_crossings(lanes, worth, seen.view.width)
-        warnings = []
+        warnings = [] if horizon is None else misfits(seen.view, horizon)
         if len(lanes) < len(believed):
             warnings.append(f"{len(believed) - len(lanes)} of {len(believed)} lanes lie above the horizon or outside")
         if not clear.all():

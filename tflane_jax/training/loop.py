@@ -173,7 +173,9 @@ def train(
         # State: fresh, of another run, or resumed
         # =============================================================================================================
         with stage("making the initial parameters"):
-            states = init_states(task, optimizer, config.seeds, first_example(arrays))
+            example = first_example(arrays)
+            example = example if prepare is None else prepare(example, (config.seeds[0], 0, 0))
+            states = init_states(task, optimizer, config.seeds, example)
         window, metrics, seconds = Window(), {}, 0.0
         memories, started_from = [Memory() for _ in config.seeds], {}
         if start == "resume" and (latest := from_first(lambda: _latest(checkpoints))) is not None:

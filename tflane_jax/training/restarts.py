@@ -50,6 +50,22 @@ class RestartsConfig:
     adaptive: AdaptiveConfig | None = None
 
 
+def doubling_cycles(steps: int, *, warmup_steps: int, cycles: int = 3, metric: str = "all/loss") -> RestartsConfig:
+    """Return cycles, each twice as long as the one before, that fill a run, with the adaptive rule.
+
+    There are `cycles` where none is extended. An extension before the last two leaves room for one less: the next to
+    last one then takes all steps that are left.
+
+    Args:
+        steps: of the run.
+        warmup_steps: before the first cycle.
+        cycles: in the run.
+        metric: by which the rule judges; lower is better.
+    """
+    first = (steps - warmup_steps) // (2**cycles - 1)
+    return RestartsConfig(first, factor=2.0, last_cycle="fit", adaptive=AdaptiveConfig(metric=metric))
+
+
 class Cycle(NamedTuple):
     """Position in the cycle of the learning rate; with several seeds, every leaf has a leading seed axis.
 

@@ -48,14 +48,14 @@ class RateSearch:
     Attributes:
         rows: names of the rows that are searched.
         rates: that are tried for each of them.
-        score: on validation data, at the last step; the highest one wins.
-        seed: of the trainings, none of the table's.
+        score: on validation data, at the last step; the highest mean over seeds wins.
+        seeds: of the trainings of each rate, none of the table's.
     """
 
     rows: tuple[str, ...]
     rates: tuple[float, ...]
     score: str
-    seed: int = 1000
+    seeds: tuple[int, ...] = (1000,)
 
 
 @dataclass(frozen=True)

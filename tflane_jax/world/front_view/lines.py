@@ -11,7 +11,7 @@ from tflane_jax.world.front_view.road import Highway
 from tflane_jax.world.render.camera import FrontCamera
 
 # TuSimple's rows, as fractions of the image's height: 160, 170, ..., 710 of 720.
-ROWS = np.arange(160, 720, 10) / 720.0
+ROW_FRACTIONS = np.arange(160, 720, 10) / 720.0
 CAPACITY = 8
 # Two lines on each side of the vehicle are annotated; five if it is nearer than this to a line, metres.
 _ON_LINE = 0.6
@@ -28,8 +28,8 @@ def label_lines(camera: FrontCamera, road: Highway, reach: float) -> LaneLines:
         road: with its lane lines.
         reach: lines are annotated up to this station, metres.
     """
-    lines = LaneLines.empty(CAPACITY, len(ROWS))
-    lines.points[..., 1] = ROWS
+    lines = LaneLines.empty(CAPACITY, len(ROW_FRACTIONS))
+    lines.points[..., 1] = ROW_FRACTIONS
     found = [_points(camera, road, number, reach) for number in marked_lines(road)]
     found = [(u, valid) for u, valid in found if valid.sum() >= _FEWEST_POINTS]
     for slot, (u, valid) in enumerate(found):
@@ -59,8 +59,8 @@ def marked_lines(road: Highway) -> Int[np.ndarray, " k"]:
 def _points(
     camera: FrontCamera, road: Highway, number: int, reach: float
 ) -> tuple[Float[np.ndarray, " p"], Bool[np.ndarray, " p"]]:
-    """Return u (fraction of the width) of one line at `ROWS`, and where it has a point."""
-    u, s = image_columns(camera, road, road.lines[number], ROWS * camera.height, reach)
+    """Return u (fraction of the width) of one line at `ROW_FRACTIONS`, and where it has a point."""
+    u, s = image_columns(camera, road, road.lines[number], ROW_FRACTIONS * camera.height, reach)
     there = np.interp(np.nan_to_num(s), road.axis.s, road.present[number].astype(float)) > 0.5
     u = u / camera.width
     with np.errstate(invalid="ignore"):

@@ -28,7 +28,8 @@ class FrontCameraConfig:
 
     Attributes:
         width, height: of the image, pixels.
-        focal: focal length at 1280 pixels of width.
+        focal: focal length at 1280 pixels of width; a guess, as are the 714 pixels that `datasets.photos` assumes for
+            TuSimple's camera.
         above_ground: metres.
         pitch: how far the optical axis points below the horizon, degrees.
         yaw: largest deviation of the axis from the vehicle's heading, degrees.

@@ -52,8 +52,11 @@ def thread_setting(cores: int | None = None, devices: int | None = None) -> dict
     device = _device(devices)
     if not device.startswith(_CPU):
         return setting | {"device": device}
-    flags = [flag for flag in setting.pop("XLA_FLAGS", "").split() if not flag.startswith("--xla_gpu_")]
-    return setting | ({"XLA_FLAGS": " ".join(flags)} if flags else {})
+    if "--xla_gpu_" in (flags := setting.get("XLA_FLAGS", "")):
+        setting["XLA_FLAGS"] = " ".join(flag for flag in flags.split() if not flag.startswith("--xla_gpu_"))
+        if not setting["XLA_FLAGS"]:
+            del setting["XLA_FLAGS"]
+    return setting
 
 
 def threads_of(start: dict[str, Any]) -> dict[str, Any] | None:

@@ -100,7 +100,7 @@ TABLES = (
     ),
     PaperTable(
         name="gtn_lane.2",
-        title="four encoders fine-tuned from the published LSTR at full size, the GTN with LSTR's two heads",
+        title="encoders fine-tuned from the published LSTR at full size; the GTN has two heads",
         rows=_rows("gtn_lane/fine_tuned", _FINE_TUNING_RATES, _WARM, _STARTS),
         conversions=_conversions("gtn_lane/fine_tuned", _WARM),
         claims=_claims(_WARM),

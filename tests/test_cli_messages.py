@@ -1,6 +1,10 @@
 """Warnings of the command line, and what the system refuses it."""
 
+import contextlib
 import errno
+
+import jax
+import pytest
 
 from tflane_jax.cli import OneLineWarnings, main
 from tflane_jax.datasets.base import TruncationWarning
@@ -24,3 +28,16 @@ def test_a_folder_that_may_not_be_read_is_one_line(monkeypatch, capsys):
     assert main(["cache", "list"]) == 2
     said = capsys.readouterr().err
     assert said == "tflane: /private/runs: Permission denied: give yourself the right, or choose another path\n"
+
+
+@pytest.mark.parametrize("full", [True, False])
+def test_a_device_whose_memory_is_full_is_one_line(full, monkeypatch, capsys):
+    text = "RESOURCE_EXHAUSTED: Out of memory" if full else "INTERNAL: no such program"
+
+    def fail(*_):
+        raise jax.errors.JaxRuntimeError(text)
+
+    monkeypatch.setattr("tflane_jax.commands.cache.show", fail)
+    with contextlib.nullcontext() if full else pytest.raises(RuntimeError, match="INTERNAL"):
+        assert main(["cache", "list"]) == 2
+        assert capsys.readouterr().err.startswith("tflane: the memory of the device is full: a smaller training.")

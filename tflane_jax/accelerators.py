@@ -72,10 +72,9 @@ def gpus() -> list[str]:
         names = [name.strip() for name in visible.split(",") if name.strip()]
         return list(itertools.takewhile(lambda name: name not in _NO_GPU, names))
     devices = Path("/dev")
-    found = list(devices.glob("nvidia[0-9]*")) or list(
-        devices.glob("dxg")
-    )  # Windows' subsystem for Linux has the latter
-    return [str(place) for place, _ in enumerate(found)]
+    # The Windows subsystem for Linux has one file, dxg, in place of one for each GPU.
+    count = len(list(devices.glob("nvidia[0-9]*"))) or int((devices / "dxg").exists())
+    return [str(place) for place in range(count)]
 
 
 def of_worker(slot: int, parallel: int) -> dict[str, str]:

@@ -58,7 +58,8 @@ def _run_command(options: argparse.Namespace, rest: Sequence[str]) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 128 + signal.SIGPIPE
     except RuntimeError as error:
-        if "RESOURCE_EXHAUSTED" not in str(error):  # as XLA says it
+        # By name, because importing JAX is slow. Other libraries say the same of a full disk.
+        if type(error).__name__ != "JaxRuntimeError" or "RESOURCE_EXHAUSTED" not in str(error):
             raise
         remedies = "a smaller training.batch_size or evaluation.batch_size, training.accumulate, precision or remat"
         print(f"tflane: the memory of the device is full: {remedies} (docs/scale.md)", file=sys.stderr)

@@ -113,10 +113,8 @@ def load_road_images(config: FrontViewConfig, *, progress: bool = True, workers:
     if count:
         stored = image_from_leaves(cached(dataset, progress=progress, workers=workers).arrays(mapped=True))
     else:
-        points, flags = (
-            np.zeros((0, CAPACITY, len(ROW_FRACTIONS), 2), np.float32),
-            np.zeros((0, CAPACITY, len(ROW_FRACTIONS)), bool),
-        )
+        flags = np.zeros((0, CAPACITY, len(ROW_FRACTIONS)), bool)
+        points = np.zeros((*flags.shape, 2), np.float32)
         lines = LaneLines(points, flags, np.zeros((0, CAPACITY), bool))
         stored = RoadImage(image=np.zeros((*shape, 3), np.uint8), image_valid=None, lines=lines)  # type: ignore
     return replace(stored, image_valid=np.broadcast_to(True, shape))

@@ -174,6 +174,7 @@ def train(
         # =============================================================================================================
         with stage("making the initial parameters"):
             example = first_example(arrays)
+            # Augmentation may change the size of images, and the model takes what it returns.
             example = example if prepare is None else prepare(example, (config.seeds[0], 0, 0))
             states = init_states(task, optimizer, config.seeds, example)
         window, metrics, seconds = Window(), {}, 0.0

@@ -124,7 +124,11 @@ def warp_example(example: RoadImage, warp: Float[np.ndarray, "3 3"] | None, size
     if not seen.all():
         image = cv2.bitwise_and(image, image, mask=seen)
     columns_rows, flags = size[::-1], cv2.WARP_INVERSE_MAP
-    image = cv2.warpAffine(image, inverse, columns_rows, flags=flags | cv2.INTER_LINEAR)
+    # OpenCV 5 warps four channels in less than half the time of three, to the same bits.
+    image = cv2.warpAffine(
+        cv2.cvtColor(image, cv2.COLOR_RGB2RGBA), inverse, columns_rows, flags=flags | cv2.INTER_LINEAR
+    )
+    image = cv2.cvtColor(image, cv2.COLOR_RGBA2RGB)
     seen = cv2.warpAffine(seen, inverse, columns_rows, flags=flags | cv2.INTER_NEAREST)
     image = cv2.bitwise_and(image, image, mask=seen)
     return RoadImage(image, seen.astype(bool), lines)
@@ -188,8 +192,12 @@ def _recoloured(example: RoadImage, factors: np.ndarray, order: Sequence[int], l
     cv2 = opencv()
     image = np.ascontiguousarray(example.image)
     seen = np.asarray(example.image_valid, np.uint8)
-    mean_grey = float(GREY @ cv2.mean(image, mask=seen)[:3]) / 255.0
-    colour = colour_map(factors, order, light, mean_grey)
+    whole = bool(seen.all())
+    if not whole:
+        image = cv2.bitwise_and(image, image, mask=seen)
+    # Padding is black, so that the sum over all pixels is that over the valid ones; OpenCV's mean under a mask is slow.
+    grey = float(GREY @ cv2.sumElems(image)[:3]) / max(cv2.countNonZero(seen), 1)
+    colour = colour_map(factors, order, light, grey / 255.0)
     colour[:, 3] *= 255.0
     image = cv2.transform(image, colour)
-    return image if seen.all() else cv2.bitwise_and(image, image, mask=seen)
+    return image if whole else cv2.bitwise_and(image, image, mask=seen)

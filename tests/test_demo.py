@@ -80,7 +80,7 @@ def test_the_demo_trains_compares_and_draws(tmp_path, monkeypatch, capsys):
     path.write_text(CONFIG)
     tiny = {"baseline": quick(load_ablations(str(path))["baseline"]), "+traffic": quick(load_config(str(path)))}
     monkeypatch.setattr(demo, "configs", lambda: tiny)
-    monkeypatch.setattr("tflane_jax.runs._drawing", lambda config: None)  # curves of the trainings take seconds
+    monkeypatch.setattr("tflane_jax.runs._drawing", lambda *_: None)  # curves of the trainings take seconds
     # In this process: the fake model does not travel to workers.
     monkeypatch.setattr(demo, "compare", partial(_compare_here, demo.compare))
     assert main(["demo", "--out", str(out)]) == 0

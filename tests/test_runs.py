@@ -49,6 +49,14 @@ def test_folders_may_be_named_by_text(config, tmp_path):
     assert open_run(f"{tmp_path}/run").step == open_run(tmp_path / "run").step
 
 
+def test_a_run_is_drawn_at_every_evaluation_or_at_its_end(config, tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr("tflane_jax.plots.save_curves", lambda path, records: drawn.append(records[-1]["step"]))
+    for when in ("often", "last"):
+        train_run(config, tmp_path / when, progress=False, drawn=when)
+    assert drawn == [2, 4, 4]
+
+
 def test_a_run_of_an_older_version_opens_and_resumes(config, tmp_path, capsys, monkeypatch):
     folder = tmp_path / "run"
     train_run(config, folder, progress=False)

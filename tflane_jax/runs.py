@@ -12,7 +12,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import numpy as np
@@ -44,6 +44,9 @@ from tflane_jax.training.state import per_seed, state_of
 # In `Manifest.progress`: the only module that a folder holds.
 _PART = "part"
 
+Drawn = Literal["often", "last"]
+"""Curves and pictures of a training: at every evaluation, or at the last step alone."""
+
 
 @dataclass(frozen=True)
 class Run:
@@ -62,8 +65,23 @@ class Run:
     params: tuple[Params, ...]
 
 
-def train_run(config: RunConfig, folder: Path | str, *, start: Start = "new", progress: bool = True) -> TrainingResult:
+def train_run(
+    config: RunConfig,
+    folder: Path | str,
+    *,
+    start: Start = "new",
+    progress: bool = True,
+    drawn: Drawn = "often",
+) -> TrainingResult:
     """Train a configuration into a folder, with data, evaluation on the validation split, curves and pictures.
+
+    Args:
+        config: what to train.
+        folder: of the run.
+        start: see `training.run_folder.claimed`.
+        progress: show a bar with rate and time left.
+        drawn: when to draw. Nobody looks at the pictures of a comparison while it trains, and those of a small model
+            take as long as twenty updates.
 
     Raises UserError like `training.loop.train` and the datasets, and `Interrupted` like that.
     """
@@ -79,10 +97,10 @@ def train_run(config: RunConfig, folder: Path | str, *, start: Start = "new", pr
     else:
         from_first(lambda: check_origin(config))
     with showing(progress and is_first()):
-        return _train(config, folder, start=start, progress=progress)
+        return _train(config, folder, start=start, progress=progress, drawn=drawn)
 
 
-def _train(config: RunConfig, folder: Path, *, start: Start, progress: bool) -> TrainingResult:
+def _train(config: RunConfig, folder: Path, *, start: Start, progress: bool, drawn: Drawn) -> TrainingResult:
     task = config.task
     with agreed(), stage("reading the training data"):
         source: Any = task.training_form(config.data.source("train"), config.data)
@@ -109,7 +127,7 @@ def _train(config: RunConfig, folder: Path, *, start: Start, progress: bool) -> 
         start=start,
         prepare=prepare,
         evaluate=evaluate,
-        draw=_drawing(config),
+        draw=_drawing(config, drawn),
         frozen=task.frozen,
         progress=progress,
     )
@@ -297,8 +315,11 @@ def evaluate_run(
     return every[0].protocol, [{name: row[name] for name in columns if name in row} for row in rows]
 
 
-def _drawing(config: RunConfig) -> Draw | None:
-    """Return the function that draws curves and a few validation examples, or None without matplotlib."""
+def _drawing(config: RunConfig, drawn: Drawn) -> Draw | None:
+    """Return the function that draws curves and a few validation examples, or None without matplotlib.
+
+    See `train_run` for `drawn`.
+    """
     if importlib.util.find_spec("matplotlib") is None:
         print(f"no pictures, which need matplotlib: {install('plot')}", file=sys.stderr)
         return None
@@ -307,6 +328,8 @@ def _drawing(config: RunConfig) -> Draw | None:
     draw_examples = config.task.drawing(config.data, config.evaluation)
 
     def draw(folder: Path, step: int, params: Params, records: list[Record]) -> None:
+        if drawn == "last" and step < config.training.steps:
+            return
         save_curves(folder / "curves.png", records)
         draw_examples(folder, step, params)
 

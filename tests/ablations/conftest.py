@@ -32,5 +32,5 @@ def cheap():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(LaneGraphTask, "evaluate", evaluate)
         patch.setattr(LaneGraphTask, "draw_comparison", draw)
-        patch.setattr("tflane_jax.runs._drawing", lambda config: None)
+        patch.setattr("tflane_jax.runs._drawing", lambda *_: None)
         yield

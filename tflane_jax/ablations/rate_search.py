@@ -20,6 +20,7 @@ from tflane_jax.ablations.finished_runs import summary_of
 from tflane_jax.ablations.jobs import Job, check_rows
 from tflane_jax.ablations.paper.table import PaperTable, RateSearch
 from tflane_jax.ablations.store import stored_jobs
+from tflane_jax.ablations.table_plan import seed_by_seed
 from tflane_jax.ablations.workers import train_all, worker_threads
 from tflane_jax.errors import UserError
 from tflane_jax.plots.tables import format_table, save_table
@@ -46,7 +47,7 @@ def search_rates(table: PaperTable, out: Path, *, jobs: int = 1, cores: int | No
     """
     plan = plan_search(table, out, jobs=jobs, cores=cores, quick=quick)
     assert table.search is not None
-    every = [job for by_rate in plan.values() for seeded in by_rate.values() for job in seeded]
+    every = seed_by_seed({f"{row}, {rate}": jobs for row, by_rate in plan.items() for rate, jobs in by_rate.items()})
     print(f"{table.name}: {len(every)} trainings for the learning rates of {len(plan)} rows", flush=True)
     failures = train_all(every, jobs, cores)
     rows = rated(table.search, plan)

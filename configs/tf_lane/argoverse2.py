@@ -4,9 +4,9 @@
     tflane eval runs/finetuned
 
 RUN is a run of `toponet_tfm.py`. The two logs are expected under `data/argoverse2`, in the layout of the download;
-`--data.train`, `--data.val` and `--data.test` name other folders, `--data.openlane` that of OpenLane-V2's split files.
-Examples have the sizes that RUN learned with, 10 s of tracks at 2 Hz among them; in key frames of a log's first 10 s,
-earlier frames are missing.
+`--data.train`, `--data.val` and `--data.test` name other folders, `--data.openlane` that of OpenLane-V2's split files,
+for its frames in place of every fifth. Examples have the sizes that RUN learned with, 10 s of tracks at 2 Hz among
+them; in key frames of a log's first 10 s, earlier frames are missing.
 One log of 32 frames shows that the program runs on real data and says little about accuracy: docs/argoverse2.md.
 """
 
@@ -31,7 +31,6 @@ def get_config() -> RunConfig:
         train=SENSOR / "train" / TRAIN,
         val=test,
         test=test,
-        openlane=Path("data/OpenLane-V2"),
         example=trained.data.example,
     )
     return dataclasses.replace(

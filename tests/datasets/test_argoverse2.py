@@ -89,8 +89,14 @@ def test_openlane_timestamps_take_their_own_pose_and_the_nearest_boxes(folder, t
     other = folder.with_name("log-c")
     shutil.copytree(folder, other)
     assert [k.timestamp_ns for k in load_log(other, openlane=openlane).keyframes] == [1000 * MS, 1500 * MS]
-    with pytest.raises(UserError, match="split files"):
+    with pytest.raises(UserError, match="OpenLane-V2's list of frames"):
         load_log(folder, openlane=tmp_path)
+    # The folder of the list itself will do; the logs of its segments are no part of the download.
+    with pytest.raises(UserError, match=r"OpenLane-V2.subset_A_segment_to_av2_log\.json is missing.*not part of"):
+        load_log(folder, openlane=openlane / "OpenLane-V2")
+    logs.rename(openlane / "OpenLane-V2" / logs.name)
+    found = load_log(folder, openlane=openlane / "OpenLane-V2").keyframes
+    assert [k.timestamp_ns for k in found] == [k.timestamp_ns for k in moments]
 
 
 def test_frames_without_a_box_are_frames_of_the_history(folder):

@@ -157,15 +157,17 @@ def test_a_submission_holds_what_the_model_predicts(data, tmp_path, capsys):
     model = replace(CAMERA_TOPONET, priors=PriorsConfig(), encoder=replace(CAMERA, bev=replace(CAMERA.bev, cameras=7)))
     config = RunConfig(
         task=LaneGraphTask(model),
-        data=replace(data, test="train", example=example, image=ImageConfig(divisor=16, scale=0.8)),
+        data=replace(data, test="val", example=example, image=ImageConfig(divisor=16, scale=0.8)),
         optim=OptimConfig(warmup_steps=0),
         training=TrainingConfig(steps=1, batch_size=2, eval_every=1, checkpoint_every=1),
     )
     train_run(config, tmp_path / "run", progress=False)
     submission = tmp_path / "submission.pkl"
-    assert main(["submit", str(tmp_path / "run"), "--out", str(submission), "--method", "one step"]) == 0
+    command = ["submit", str(tmp_path / "run"), "--out", str(submission), "--method", "one step"]
+    assert main(command) == 2  # no frame of the split that the configuration tests on is there
+    assert main([*command, "--split", "train"]) == 0
     assert f"{SCENES * FRAMES} frames" in capsys.readouterr().out
-    run, source = open_run(tmp_path / "run"), config.data.source("test")
+    run, source = open_run(tmp_path / "run"), config.data.source("train")
     written, keys = read_predictions(submission), OpenLaneV2Dataset(source).keys
     assert list(written) == keys
     arrays = config.task.load(source, progress=False)

@@ -60,6 +60,18 @@ def test_a_folder_of_annotations_gives_the_same(files):
     assert run(files)[1]["rows"] == run(files, truth="data/val")[1]["rows"]
 
 
+def test_of_a_dataset_the_predicted_splits_alone_are_read(files, capsys):
+    for split in ("train", "val", "test"):  # frames of the test have no annotation
+        for _, segment, timestamp in FRAMES:
+            info = files / "data" / split / segment / "info"
+            info.mkdir(parents=True, exist_ok=True)
+            annotated = {} if split == "test" else {"annotation": centerline_annotation(TRUTH)}
+            (info / f"{timestamp}.json").write_text(json.dumps(annotated))
+    assert run(files)[1]["rows"] == run(files, truth="data")[1]["rows"]
+    assert run(files, truth="data/train")[0] == 2
+    assert "data/train holds no annotations of split val" in capsys.readouterr().err
+
+
 def test_dense_annotations_are_thinned(files):
     # A straight line of 201 points; every 20th is what the detections were measured against.
     dense = dataclasses.replace(TRUTH, points=[np.linspace(line[0], line[-1], 201) for line in TRUTH.points])

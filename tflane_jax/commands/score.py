@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -43,10 +43,10 @@ def run(options: argparse.Namespace) -> int:
     for remark in remarks:
         print(f"tflane: {remark}", file=sys.stderr)
     rows = _rows(scored, options.by, options.bootstrap)
-    rows += [{"part": group, **values} for group, values in (groups or {}).items() if group != "all"]
+    rows += [{"part": group} | _of_part(values) for group, values in (groups or {}).items() if group != "all"]
 
     title = f"{options.predictions.name}: {scored.protocol}"
-    # A part without lanes and detections has DET_l 1, so the numbers of both are shown.
+    # What the scores of a part rest on.
     counted = () if options.by is None else _COUNTED
     shown = [name for name in ("part", *protocol.columns, *counted, "frames") if any(name in row for row in rows)]
     print(format_table(rows, shown, title=title, digits=4))
@@ -91,6 +91,13 @@ def _scored(files: str, run_score: Callable[[], Scored]) -> Scored:
         return run_score()
     except UserError as error:
         raise UserError(f"{files}: {error}") from None
+
+
+def _of_part(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the numbers of a part of the lanes or lines; without any, counts alone: by convention DET_l would be 1."""
+    if any(values.get(name) == 0 for name in _COUNTED):
+        return {name: value for name, value in values.items() if name in (*_COUNTED, "frames")}
+    return dict(values)
 
 
 def _rows(scored: Scored, by: str | None, samples: int) -> list[dict[str, Any]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -43,6 +44,9 @@ def run(options: argparse.Namespace) -> int:
     if options.data is None and options.root is not None:
         options.data = "nuscenes" if "lines" in predicts else "openlane-v2"
     source = source_for(trained, options)
+    if isinstance(source, OpenLaneV2Config | NuScenesConfig) and options.split is not None:
+        # Configurations evaluate on the validation split in place of the test, which has no truth.
+        source = replace(source, split=options.split)
     if isinstance(source, OpenLaneV2Config):
         if not {"centerlines", "segments"} & predicts:
             raise UserError("this model predicts neither centerlines nor lane segments: OpenLane-V2 has no other task")

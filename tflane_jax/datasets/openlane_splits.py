@@ -12,7 +12,7 @@ import numpy as np
 from tflane_jax.errors import UserError
 from tflane_jax.files.fields import as_list, is_time, load_json, member, shown
 
-SPLIT_FILE, LOG_FILE = "OpenLane-V2/data_dict_subset_A.json", "subset_A_segment_to_av2_log.json"
+SPLIT_FILE, LOG_FILE = "data_dict_subset_A.json", "subset_A_segment_to_av2_log.json"
 
 
 @functools.lru_cache(maxsize=4)
@@ -20,14 +20,20 @@ def openlane_timestamps(folder: Path) -> dict[str, np.ndarray]:
     """Return the ascending frame timestamps (F,), int64 nanoseconds, of every Argoverse 2 log in subset A, by log id.
 
     Args:
-        folder: holds OpenLane-V2/data_dict_subset_A.json and subset_A_segment_to_av2_log.json (segment to log id).
+        folder: holds OpenLane-V2/data_dict_subset_A.json, or that file itself, and subset_A_segment_to_av2_log.json:
+            the log of each segment, by split. The second is not part of the download.
 
     Raises UserError where one of the files is missing or damaged.
     """
-    files = [Path(folder) / name for name in (SPLIT_FILE, LOG_FILE)]
-    for path in files:
-        if not path.is_file():
-            raise UserError(f"{path} is missing: it is one of the OpenLane-V2 split files")
+    below = folder / "OpenLane-V2" / SPLIT_FILE
+    files = [below if below.is_file() else folder / SPLIT_FILE, folder / LOG_FILE]
+    if not files[0].is_file():
+        raise UserError(f"{below} is missing, OpenLane-V2's list of frames; {files[0]} will do too")
+    if not files[1].is_file():
+        raise UserError(
+            f"{files[1]} is missing: the Argoverse 2 log of each segment, {{split: {{segment: log id}}}}, which is not "
+            "part of OpenLane-V2's download (docs/argoverse2.md says how segments are numbered)"
+        )
     frames, logs = (_by_split(path) for path in files)
     found = {}
     for split, segments in frames.items():

@@ -9,7 +9,7 @@ docs/reference/data_formats.md, section 2, and docs/reference/metrics.md, sectio
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -54,9 +54,17 @@ def read_predictions(path: Path) -> dict[FrameKey, LaneDetections]:
     return _submission(path, lambda record, where: _detections(record, where, CENTERLINE))
 
 
-def read_truth(path: Path, *, progress: bool = True) -> dict[FrameKey, LaneTruth]:
-    """Return centerline annotations, a collected file's or a folder's; raises UserError as `read_predictions`."""
-    return _annotations(path, CENTERLINE, lambda record, where: _truth(record, where, CENTERLINE), progress)
+def read_truth(
+    path: Path, *, splits: Collection[str] | None = None, progress: bool = True
+) -> dict[FrameKey, LaneTruth]:
+    """Return centerline annotations, a collected file's or a folder's; raises UserError as `read_predictions`.
+
+    Args:
+        path: the file or folder.
+        splits: those of a folder that are read; None for all.
+        progress: show a bar.
+    """
+    return _annotations(path, CENTERLINE, lambda record, where: _truth(record, where, CENTERLINE), splits, progress)
 
 
 def read_segment_predictions(path: Path) -> dict[FrameKey, SegmentDetections]:
@@ -65,14 +73,14 @@ def read_segment_predictions(path: Path) -> dict[FrameKey, SegmentDetections]:
 
 
 def read_segment_truth(
-    path: Path, flavour: Flavour = "OpenLane-V2", *, progress: bool = True
+    path: Path, flavour: Flavour = "OpenLane-V2", *, splits: Collection[str] | None = None, progress: bool = True
 ) -> dict[FrameKey, SegmentTruth]:
-    """Return lane-segment annotations, a collected file's or a folder's; raises UserError as `read_predictions`.
+    """Return lane-segment annotations; path, splits, progress and errors are those of `read_truth`.
 
     Lines are resampled to 10 points and areas to 20. In the flavour "LaneSegNet" a crossing of five corners becomes its
     two long sides of 10 points each.
     """
-    return _annotations(path, SEGMENT, lambda record, where: _segment_truth(record, where, flavour), progress)
+    return _annotations(path, SEGMENT, lambda record, where: _segment_truth(record, where, flavour), splits, progress)
 
 
 T = TypeVar("T")
@@ -86,18 +94,22 @@ def _submission(path: Path, parse: _Parse[T]) -> dict[FrameKey, T]:
     return _by_frame(results, "predictions", path, parse)
 
 
-def _annotations(path: Path, names: FieldNames, parse: _Parse[T], progress: bool) -> dict[FrameKey, T]:
+def _annotations(
+    path: Path, names: FieldNames, parse: _Parse[T], splits: Collection[str] | None, progress: bool
+) -> dict[FrameKey, T]:
     if not os.path.isdir(path):
         collected = load_file(path)
         if not isinstance(collected, Mapping):
             raise UserError(f"{path} is of type {type(collected).__name__}, expected a mapping from frames")
         return _by_frame(collected, "annotation", path, parse)
-    stems = {file: file.stem.removesuffix("-ls") for file in sorted(path.resolve().glob("**/info/*.json"))}
+    stems = {file: file.stem.removesuffix("-ls") for file in _annotation_files(path.resolve(), splits)}
     files = {file: stem for file, stem in stems.items() if file.stem == stem + names.suffix}
     if not files:
         other = f"; it has {len(stems)} files of the other task" if stems else ""
+        of = f" of split {', '.join(sorted(splits))}" if splits else ""
         raise UserError(
-            f"{path} holds no annotations: expected <split>/<segment>/info/<timestamp>{names.suffix}.json in it{other}"
+            f"{path} holds no annotations{of}: expected <split>/<segment>/info/<timestamp>{names.suffix}.json in it"
+            f"{other}"
         )
     frames, origin = {}, {}
     for file, stem in progress_bar(files.items(), desc=f"read {path.name}", unit="frame", disable=not progress):
@@ -108,6 +120,15 @@ def _annotations(path: Path, names: FieldNames, parse: _Parse[T], progress: bool
         origin[key] = file
         frames[key] = parse(member(load_file(file), "annotation", str(file)), str(file))
     return frames
+
+
+def _annotation_files(folder: Path, splits: Collection[str] | None) -> list[Path]:
+    """Return the annotations in the dataset's folder, or in that of a split."""
+    if splits is None:
+        return sorted(folder.glob("**/info/*.json"))
+    below = [folder / split for split in splits if (folder / split).is_dir()] or [folder]
+    files = (file for each in below for file in each.glob("**/info/*.json"))
+    return sorted(file for file in files if file.parent.parent.parent.name in splits)
 
 
 def _by_frame(records: Mapping[Any, Any], field: str, path: Path, parse: _Parse[T]) -> dict[FrameKey, T]:

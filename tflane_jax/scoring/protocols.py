@@ -12,6 +12,7 @@ from typing import Any
 from tflane_jax.errors import UserError
 from tflane_jax.files import tusimple
 from tflane_jax.files.fields import PICKLE_SUFFIXES
+from tflane_jax.files.openlane import FrameKey
 from tflane_jax.metrics.f_score import CenterlineFScore
 from tflane_jax.metrics.groups import ByDistance
 from tflane_jax.metrics.lane_segment import Flavour, GroupedSegmentMetrics, LaneSegmentMetrics
@@ -30,7 +31,8 @@ class ScoringProtocol:
     """One protocol.
 
     Attributes:
-        read_predictions, read_truth: read a path and return the input of the metric by frame.
+        read_predictions, read_truth: read a path and return the input of the metric by frame. With frames that have a
+            split, `read_truth` takes the `splits` of a folder to read.
         scene_of: returns the name of a frame's scene.
         metrics: returns a new accumulator.
         columns: of the table, in this order; the JSON file has them all.
@@ -44,7 +46,7 @@ class ScoringProtocol:
     """
 
     read_predictions: Callable[[Path], Mapping[Any, Any]]
-    read_truth: Callable[[Path], Mapping[Any, Any]]
+    read_truth: Callable[..., Mapping[Any, Any]]
     scene_of: Callable[[Any], str]
     metrics: Callable[[], Accumulator]
     columns: tuple[str, ...]
@@ -56,9 +58,14 @@ class ScoringProtocol:
     no_scenes: str = ""
 
     def read(self, predictions: Path, truth: Path) -> tuple[Mapping[Any, Any], Mapping[Any, Any]]:
-        """Return the content of both files by frame; raises UserError that names file, frame, field and cause."""
+        """Return the content of both files by frame; raises UserError that names file, frame, field and cause.
+
+        Of OpenLane-V2's folder, the splits that are predicted are read: that of the test has no annotations.
+        """
         found = self._read(self.read_predictions, predictions, "predictions")
-        return found, self._read(self.read_truth, truth, "ground truth")
+        splits = {key.split for key in found if isinstance(key, FrameKey)}
+        read = partial(self.read_truth, splits=splits) if splits and truth.is_dir() else self.read_truth
+        return found, self._read(read, truth, "ground truth")
 
     def _read(self, read: Callable[[Path], Mapping[Any, Any]], path: Path, side: Side) -> Mapping[Any, Any]:
         try:
@@ -68,13 +75,13 @@ class ScoringProtocol:
             raise UserError(f"{error}{hint(path, side, self.formats, formats)}") from None
 
 
-def _plain_or(read_plain: Callable[[Path], Any], read_official: Callable[[Path], Any]) -> Callable[[Path], Any]:
-    def read(path: Path) -> Any:
+def _plain_or(read_plain: Callable[[Path], Any], read_official: Callable[..., Any]) -> Callable[..., Any]:
+    def read(path: Path, **options: Any) -> Any:
         if path.suffix in plain.SUFFIXES:
             return read_plain(path)
         if path.suffix not in PICKLE_SUFFIXES and not path.is_dir():
             raise UserError(f"{path}: expected a .pkl, .json or .npz file; docs/scoring.md says what it holds")
-        return read_official(path)
+        return read_official(path, **options)
 
     return read
 

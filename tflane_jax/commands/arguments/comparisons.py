@@ -9,9 +9,10 @@ from tflane_jax.commands.arguments.shared import OVERRIDES, command, stem
 _FILES = """Protocols and their files:
   openlane-v2.1-centerline, openlane-v1.0-centerline
       PREDICTIONS is the pickle of an OpenLane-V2 submission; GROUND_TRUTH the devkit's collected pickle, or the
-      dataset's folder with SPLIT/SEGMENT/info/TIMESTAMP.json. The versions differ in TOP_ll and TOP_lt, by a factor
-      of about four: say which one you report. v2.1 is also the metric of devkit v1.1. Both files may also be plain .npz
-      or .json (docs/scoring.md), as written by `tflane predict`, without traffic elements.
+      dataset's folder with SPLIT/SEGMENT/info/TIMESTAMP.json, of which the predicted splits are read. The versions
+      differ in TOP_ll and TOP_lt, by a factor of about four: say which one you report. v2.1 is also the metric of
+      devkit v1.1. Both files may also be plain .npz, as `tflane predict` writes, or .json of another form
+      (docs/scoring.md), without traffic elements.
   openlane-v2.1-lane-segment, lanesegnet
       The same files of the lane-segment task (TIMESTAMP-ls.json). The first gives the devkit's OLUS, the second the
       mAP of the LaneSegNet and TF-Lane papers.

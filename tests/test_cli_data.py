@@ -19,7 +19,12 @@ def test_data_stats_counts_lanes_and_traffic(capsys):
     rows = {line.split("|")[1].strip(): line.split("|")[2:-1] for line in printed.splitlines() if "|" in line}
     mean, low, _, high = map(float, rows["lanes"])
     assert 1.0 <= low <= mean <= high
-    for quantity in ("lanes hidden+traffic", "- standing vehicles", "examples with more than 30"):
+    for quantity in (
+        "lanes hidden+traffic",
+        "metres of lanes hidden+traffic",
+        "- standing vehicles",
+        "examples with more than 30",
+    ):
         assert quantity in rows
     driven = [float(cell) for cell in rows["fraction of lane length driven on"]]
     assert 0.0 < min(driven) <= max(driven) < 1.0

@@ -31,8 +31,9 @@ def example_stats(example: Example, config: ExampleConfig) -> dict[str, float]:
         driven, _ = driven_fraction(np.asarray(lanes.points)[lanes.valid], flow)
     found = _lane_stats(lanes, driven)
     if flow is not None and driven is not None and example.bev is not None:
-        groups = lane_groups(lanes, np.asarray(example.bev), flow, config.ground)
+        groups, metres = lane_groups(lanes, np.asarray(example.bev), flow, config.ground), _lengths(lanes)
         found |= {f"lanes {name}": members.sum() for name, members in groups.items()}
+        found |= {f"metres of lanes {name}": metres[members].sum() for name, members in groups.items()}
     if flow is not None and driven is not None:
         found |= _traffic_stats(flow, config)
     return found if example.map_lines is None else found | _line_stats(example.map_lines)
@@ -54,8 +55,7 @@ def _lane_stats(lanes: LaneGraph, driven: Float[np.ndarray, " g"] | None) -> dic
     """Return the quantities of lanes; `driven` is the fraction of each valid lane that vehicles drove along."""
     valid = np.asarray(lanes.valid)
     hidden = np.asarray(lanes.visibility)[valid] < _HIDDEN
-    step = np.diff(np.asarray(lanes.points)[valid][..., :2], axis=1)
-    metres = np.linalg.norm(step, axis=-1).sum(-1)
+    metres = _lengths(lanes)
     found = {
         "lanes": valid.sum(),
         "lanes out of sight": hidden.sum(),
@@ -67,6 +67,12 @@ def _lane_stats(lanes: LaneGraph, driven: Float[np.ndarray, " g"] | None) -> dic
         if metres.sum() > 0:
             found["fraction of lane length driven on"] = (driven * metres).sum() / metres.sum()
     return found
+
+
+def _lengths(lanes: LaneGraph) -> Float[np.ndarray, " g"]:
+    """Return the lengths of the valid lanes in the ground plane, metres."""
+    step = np.diff(np.asarray(lanes.points)[np.asarray(lanes.valid)][..., :2], axis=1)
+    return np.linalg.norm(step, axis=-1).sum(-1)
 
 
 def _traffic_stats(flow: TrafficFlow, config: ExampleConfig) -> dict[str, float]:

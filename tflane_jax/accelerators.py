@@ -92,7 +92,7 @@ def of_worker(slot: int, parallel: int) -> dict[str, str]:
     # JAX computes on the CPU, with no more than a logged error, where both names are set.
     if not any(name in os.environ for name in _FRACTIONS):
         found[_FRACTIONS[0]] = f"{_SHARED_FRACTION / sharing:.3f}"
-    # CUDA's own choice asks the GPU without pause, on a core that augments images for the next batch.
+    # CUDA may choose to ask the GPU without pause, on the core that augments images (its effect was not measured).
     found[_WAITING] = os.environ.get(_WAITING, "blocking_sync")
     return found
 

@@ -44,8 +44,8 @@ from tflane_jax.training.state import per_seed, state_of
 # In `Manifest.progress`: the only module that a folder holds.
 _PART = "part"
 
-Drawn = Literal["often", "last"]
-"""Curves and pictures of a training: at every evaluation, or at the last step alone."""
+Drawn = Literal["evaluations", "end"]
+"""When a training draws curves and pictures: at every evaluation, or at its last step alone."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ def train_run(
     *,
     start: Start = "new",
     progress: bool = True,
-    drawn: Drawn = "often",
+    drawn: Drawn = "evaluations",
 ) -> TrainingResult:
     """Train a configuration into a folder, with data, evaluation on the validation split, curves and pictures.
 
@@ -328,7 +328,7 @@ def _drawing(config: RunConfig, drawn: Drawn) -> Draw | None:
     draw_examples = config.task.drawing(config.data, config.evaluation)
 
     def draw(folder: Path, step: int, params: Params, records: list[Record]) -> None:
-        if drawn == "last" and step < config.training.steps:
+        if drawn == "end" and step < config.training.steps:
             return
         save_curves(folder / "curves.png", records)
         draw_examples(folder, step, params)

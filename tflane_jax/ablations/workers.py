@@ -101,7 +101,7 @@ def _train_here(queue: Queue) -> list[Failure]:
         with noted(job, failures):
             queue.check_origins(job)
             write(f"train {job.label or job.folder}")
-            if (number := train_run(job.config, job.folder, start=job.start(), drawn="last").asked_by) is not None:
+            if (number := train_run(job.config, job.folder, start=job.start(), drawn="end").asked_by) is not None:
                 raise Interrupted(number)  # all of it; the same command resumes what was written
         queue.done(job)
         _tell([failure for failure in failures if failure.job is job])
@@ -244,7 +244,7 @@ def _check_setting(job: Job) -> None:
 
 
 def _train(job: Job) -> None:
-    result = train_run(job.config, job.folder, start=job.start(), progress=False, drawn="last")
+    result = train_run(job.config, job.folder, start=job.start(), progress=False, drawn="end")
     if result.stopped_by is not None:
         raise UserError(f"stopped by {signal.Signals(result.stopped_by).name} after step {result.step}")
 

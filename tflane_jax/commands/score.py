@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import check_stem
+from tflane_jax.metrics.groups import shown_of_part
 from tflane_jax.plots.tables import format_table, save_table, written_to
 from tflane_jax.scoring import remarks as about
 from tflane_jax.scoring.protocols import ScoringProtocol, find_protocol
@@ -43,7 +44,7 @@ def run(options: argparse.Namespace) -> int:
     for remark in remarks:
         print(f"tflane: {remark}", file=sys.stderr)
     rows = _rows(scored, options.by, options.bootstrap)
-    rows += [{"part": group} | _of_part(values) for group, values in (groups or {}).items() if group != "all"]
+    rows += [{"part": group} | shown_of_part(values) for group, values in (groups or {}).items() if group != "all"]
 
     title = f"{options.predictions.name}: {scored.protocol}"
     # What the scores of a part rest on.
@@ -91,13 +92,6 @@ def _scored(files: str, run_score: Callable[[], Scored]) -> Scored:
         return run_score()
     except UserError as error:
         raise UserError(f"{files}: {error}") from None
-
-
-def _of_part(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the numbers of a part of the lanes or lines; without any, counts alone: by convention DET_l would be 1."""
-    if any(values.get(name) == 0 for name in _COUNTED):
-        return {name: value for name, value in values.items() if name in (*_COUNTED, "frames")}
-    return dict(values)
 
 
 def _rows(scored: Scored, by: str | None, samples: int) -> list[dict[str, Any]]:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
 from tflane_jax.limits import DIFFERENT, NOT_EMPTY, Count, CountOrZero
+from tflane_jax.metrics.groups import COUNTS, shown_of_part
 from tflane_jax.metrics.map_matching import Measure
 from tflane_jax.metrics.topology import Version
 
@@ -80,20 +81,15 @@ class Evaluation:
 
     protocol: str
     groups: Mapping[str, Mapping[str, float]]
-    counts: tuple[str, ...] = ("frames", "lanes", "lines")
+    counts: tuple[str, ...] = COUNTS
     ratios: Mapping[str, SceneRatio] = field(default_factory=dict)
     samples: Callable[[], Mapping[str, SceneSamples]] = field(default=dict, compare=False)
 
     def shown(self, group: str) -> dict[str, float]:
-        """Return the numbers of a group for a table: counts alone if it is a part of the lanes or lines and has none.
-
-        By the official convention it would have DET_l 1, which only the whole test set keeps.
-        """
+        """Return the numbers of a group for a table; a part of the lanes or lines as `shown_of_part`."""
         values = self.groups[group]
         whole = group.removeprefix("segments ") in ("all", "lines", "lines IoU")
-        if whole or values.get("lanes", values.get("lines")) != 0:
-            return dict(values)
-        return {name: value for name, value in values.items() if name in self.counts}
+        return dict(values) if whole else shown_of_part(values)
 
     def scores(self) -> dict[str, float]:
         """Return the scores by "group/name", without counts. Runs record them and rate checkpoints by them."""

@@ -27,6 +27,19 @@ from tflane_jax.metrics.frames import Lines, check_shape
 from tflane_jax.metrics.merging import joined
 from tflane_jax.metrics.resampling import Weights
 
+COUNTS = ("frames", "lanes", "lines")
+"""Numbers of a group that are no scores, but what its scores rest on."""
+
+
+def shown_of_part(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the numbers of a part of the lanes or lines for a table; counts alone if it has none.
+
+    By the official convention it would have DET_l 1, which only the whole test set keeps.
+    """
+    if values.get("lanes", values.get("lines")) != 0:
+        return dict(values)
+    return {name: value for name, value in values.items() if name in COUNTS}
+
 
 class TrueLanes(Protocol):
     """True lanes of one frame, or lines of a map in their place."""

@@ -123,10 +123,11 @@ def _annotations(
 
 
 def _annotation_files(folder: Path, splits: Collection[str] | None) -> list[Path]:
-    """Return the annotations in the dataset's folder, or in that of a split."""
+    """Return the annotations of some splits (None: all) in the dataset's folder, or in that of one split."""
     if splits is None:
         return sorted(folder.glob("**/info/*.json"))
-    below = [folder / split for split in splits if (folder / split).is_dir()] or [folder]
+    # Not `folder / split`: that name comes from the predictions, and "/" is one.
+    below = [found for found in folder.iterdir() if found.name in splits and found.is_dir()] or [folder]
     files = (file for each in below for file in each.glob("**/info/*.json"))
     return sorted(file for file in files if file.parent.parent.parent.name in splits)
 

@@ -75,6 +75,11 @@ def write(path, *features, **other):
         ({"highway": ["raceway", "residential", "service"]}, SdCategory.RESIDENTIAL),
         ({"highway": "trunk_link; primary"}, SdCategory.TRUCK_ROAD),
         ({"highway": ["raceway"]}, SdCategory.OTHER),
+        # As SMERF sorts the roads.
+        ({"highway": "motorway"}, SdCategory.TRUCK_ROAD),
+        ({"highway": "tertiary_link"}, SdCategory.HIGHWAY),
+        ({"highway": "road"}, SdCategory.ROAD),
+        ({"highway": "unclassified"}, SdCategory.OTHER),
         # As a table is exported whose other rows have the column.
         ({"highway": "service", "category": None}, SdCategory.SERVICE),
         ({"highway": None, "category": "road"}, SdCategory.ROAD),
@@ -100,7 +105,7 @@ def test_a_file_becomes_a_map_around_the_vehicle(tmp_path):
     )
     roads = read_geojson(path)
     walk = SdCategory.CROSSWALK
-    expected = [SdCategory.RESIDENTIAL, walk, walk, SdCategory.HIGHWAY, SdCategory.OTHER]
+    expected = [SdCategory.RESIDENTIAL, walk, walk, SdCategory.TRUCK_ROAD, SdCategory.OTHER]
     assert list(roads.category) == expected
     sd_map = sd_map_around(roads, Origin(49.0, 8.4, 90.0), SdMapConfig(lines=6, points=3))
     sd_map.validate()

@@ -3,8 +3,12 @@
 Runs on the host with numpy and OpenCV: all geometry, with a change of size, is one affine warp, all colour one affine
 map of RGB. The content of padding never reaches the result; pixels that the warp does not cover are black and invalid.
 Source: the training settings of LSTR, https://github.com/liuruijin17/LSTR. It rotates and crops the full frame, then
-resizes it. What still differs: colours are clipped to 0 to 255, and a line ends at its last labelled point in the
-image, where LSTR's imgaug adds a point at the border.
+resizes it. What still differs:
+
+- one bilinear warp, where imgaug rotates and crops bilinearly and then reduces bicubically;
+- colours are clipped to 0 to 255; padding stays black and does not enter the mean grey of the contrast;
+- a line ends at its last labelled point in the image and is dropped if only one is left. imgaug adds points at the
+  border, and splits a line that leaves the image and comes back.
 """
 
 from __future__ import annotations

@@ -37,14 +37,14 @@ CATEGORIES = {
     "bus_way": SdCategory.BUS_WAY,
     "other": SdCategory.OTHER,
 }
-# OpenStreetMap's values of `highway`; a link counts as what it links.
+# SMERF's categories of OpenStreetMap's values of `highway`, and `crossing`, which SMERF counts as other. A link counts
+# as what it links.
 HIGHWAYS = {
-    "motorway": SdCategory.HIGHWAY,
+    "motorway": SdCategory.TRUCK_ROAD,
     "trunk": SdCategory.TRUCK_ROAD,
-    "primary": SdCategory.ROAD,
-    "secondary": SdCategory.ROAD,
-    "tertiary": SdCategory.ROAD,
-    "unclassified": SdCategory.ROAD,
+    "primary": SdCategory.HIGHWAY,
+    "secondary": SdCategory.HIGHWAY,
+    "tertiary": SdCategory.HIGHWAY,
     "road": SdCategory.ROAD,
     "residential": SdCategory.RESIDENTIAL,
     "living_street": SdCategory.RESIDENTIAL,

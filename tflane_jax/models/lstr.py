@@ -26,7 +26,7 @@ from tflane_jax.models.auxiliary import AUXILIARY, AuxiliaryName
 from tflane_jax.models.graph_encoders import GcnEncoderConfig, GtnEncoderConfig, HanEncoderConfig
 from tflane_jax.scene import CurvePrediction
 
-# TuSimple statistics of values in [0, 1], in BGR order, which the published weights expect.
+# Mean and deviation of values in [0, 1], in BGR order: CornerNet's, which LSTR took over.
 MEAN_BGR = (0.40789654, 0.44719302, 0.47026115)
 STD_BGR = (0.28863828, 0.27408164, 0.27809835)
 
@@ -226,7 +226,7 @@ def _like(values: np.ndarray, x: Array) -> Array:
 
 
 def normalise(image: UInt8[Array, "*b h w 3"], valid: Bool[Array, "*b h w"]) -> Float[Array, "*b h w 3"]:
-    """Return the network's input from RGB images: BGR, zero mean and unit variance over TuSimple, black padding."""
+    """Return the network's input from RGB images: BGR, less CornerNet's mean, over its deviation; black padding."""
     image = jnp.where(valid[..., None], image, 0)
     lead = (1,) * (image.ndim - 1)
     mean, std = (jnp.asarray(values).reshape(*lead, 3) for values in (MEAN_BGR, STD_BGR))

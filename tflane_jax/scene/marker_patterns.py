@@ -34,17 +34,32 @@ class MarkerFamily(enum.Enum):
 
 BOARD_SIZES = (0.01, 100.0)
 """Smallest and largest side of a marker's black square, metres."""
+# Wrong bits to correct: floor((d - 1) / 2) of the least distance d, and 1 in the original family, where some ids look
+# alike when they are turned. Older versions of OpenCV have 12 for ARUCO_MIP_36H12 and 0 for the others.
+_CORRECTABLE = {
+    MarkerFamily.ARUCO_ORIGINAL: 1,
+    MarkerFamily.ARUCO_MIP_36H12: 5,
+    MarkerFamily.APRILTAG_16H5: 2,
+    MarkerFamily.APRILTAG_25H9: 4,
+    MarkerFamily.APRILTAG_36H10: 4,
+    MarkerFamily.APRILTAG_36H11: 5,
+}
 # Width in cells of the white margin of a printed marker, which detectors need.
 MARGIN = 1
 
 
 @functools.cache
 def dictionary_of(family: MarkerFamily) -> Any:
-    """Return OpenCV's dictionary; raises UserError if OpenCV or its aruco module is missing."""
+    """Return OpenCV's dictionary, which corrects as many bits in every version of OpenCV.
+
+    Raises UserError if OpenCV or its aruco module is missing.
+    """
     cv2 = opencv()
     if not hasattr(cv2, "aruco") or not hasattr(cv2.aruco, "ArucoDetector"):
         raise UserError("this OpenCV has no aruco.ArucoDetector: pip install 'opencv-python-headless>=4.10'")
-    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, family.value))
+    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, family.value))
+    dictionary.maxCorrectionBits = _CORRECTABLE.get(family, dictionary.maxCorrectionBits)
+    return dictionary
 
 
 def marker_count(family: MarkerFamily) -> int:

@@ -129,7 +129,7 @@ def test_a_table_from_its_record_is_that_of_its_runs(tiny, made, tmp_path, monke
     (content, commits), (expected, own) = summary(tmp_path), summary(made)
     assert content == expected
     assert len(commits) == len(own) + 1
-    assert commits[-1].startswith("recorded by code ")
+    assert commits[-1].startswith("recorded by code of digest ")
     # What was taken from a record is recorded as it was, and recording it again changes nothing.
     scores = results / "scores" / "paper.9.json.gz"
     assert (tmp_path / "paper.9" / "scores.json.gz").read_bytes() == scores.read_bytes()
@@ -234,7 +234,7 @@ def test_scores_by_an_earlier_state_of_the_code_may_stay(tiny, made, tmp_path, m
     with monkeypatch.context() as patch:
         forbid(patch, "scores.open_run")
         run_table(small(tiny), range(2), tmp_path, scored_by="any code")
-    assert summary(tmp_path)[1][-1].startswith("measured by code ")
+    assert summary(tmp_path)[1][-1].startswith("measured by code of digest ")
     assert summary(tmp_path)[0] == summary(made)[0]
     plan = plan_table(small(tiny), range(1), tmp_path)
     assert not any(is_measured(job) for (job,) in plan.jobs.values())

@@ -35,6 +35,10 @@ def test_the_report_says_what_was_declared_and_found(results, tmp_path, capsys):
     assert {row["checkpoint"] for row in rows} == {"last", "best"}
     assert [row["model"] for row in rows[:4]] == ["+TFM", "baseline", "+TFM, none", "matched"]
     assert "finding" not in rows[0]
+    for row in rows:
+        if "difference" in row:  # its interval over seeds excludes 0 where the test does, before correction
+            assert row["seeds from"] < row["difference"] < row["seeds to"]
+            assert (row["seeds from"] * row["seeds to"] > 0) == (row["p"] < 0.05)
     assert "too narrow" not in text
     why = TUSIMPLE.no_drives
     path = save_effects(results, declared, "", judged_claims(results, DECLARED, ""), tmp_path / "drives", no_drives=why)

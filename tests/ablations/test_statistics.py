@@ -19,6 +19,9 @@ def test_against_the_formula():
     assert got.std == pytest.approx(d.std(ddof=1))
     assert got.p_value == pytest.approx(2 * stats.t.sf(abs(t), 3))
     assert (got.better, got.seeds) == (3, 4)
+    assert got.interval() == pytest.approx(stats.t.interval(0.95, 3, d.mean(), d.std(ddof=1) / 2))
+    low, high = got.interval(1 - got.p_value)  # at the level of p, it ends at 0
+    assert min(abs(low), abs(high)) == pytest.approx(0.0, abs=1e-9)
 
 
 def test_swapping_changes_the_sign_only():
@@ -34,14 +37,15 @@ def test_one_seed_has_no_test():
     assert got.mean == 0.5
     assert math.isnan(got.std)
     assert math.isnan(got.p_value)
+    assert all(map(math.isnan, got.interval()))
 
 
 def test_differences_without_spread():
     assert paired_difference([1.0, 2.0], [1.0, 2.0]).p_value == 1.0
-    assert paired_difference([2.0, 3.0], [1.0, 2.0]).p_value == 0.0
+    assert paired_difference([2.0, 3.0], [1.0, 2.0]).p_value == 0.5  # two coins that fall alike
     # Equal shares of few lanes, which differ by the rounding of their subtraction.
     same = paired_difference([0.5, 0.8, 0.3], [0.4, 0.7, 0.2])
-    assert (same.mean, same.std, same.p_value, same.better) == (pytest.approx(0.1), 0.0, 0.0, 3)
+    assert (same.mean, same.std, same.p_value, same.better) == (pytest.approx(0.1), 0.0, 0.25, 3)
     none = paired_difference([0.1 + 0.2, 0.4, 0.5], [0.3, 0.4, 0.5])
     assert (none.std, none.p_value, none.better) == (0.0, 1.0, 0)
 

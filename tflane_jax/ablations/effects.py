@@ -57,7 +57,8 @@ class Effect:
         row: the other row.
         mean, std: of the other row, over seeds; the standard deviation with n - 1, NaN for one seed.
         difference: treatment minus the other row, mean over seeds.
-        low, high: 95 % interval of the difference over scenes; NaN where there is none.
+        low, high: 95 % interval of the difference over scenes, the seeds averaged; NaN where there is none.
+        seeds_low, seeds_high: 95 % t interval over seeds, on these scenes; NaN for one seed.
         p, p_holm: of the two-sided paired t-test over seeds, and corrected for all of this measure and checkpoint.
         better: number of seeds in which the treatment is better.
         seeds: that both rows have.
@@ -73,6 +74,8 @@ class Effect:
     difference: float
     low: float
     high: float
+    seeds_low: float
+    seeds_high: float
     p: float
     p_holm: float
     better: int
@@ -221,6 +224,7 @@ def _effect(
     samples = _samples(results, test, which, measure, both, seeds)
     low, high = interval(samples[claim.treatment] - samples[row]) if samples else (math.nan, math.nan)
     paired = paired_difference(sign * treated, sign * other)
+    seeds_low, seeds_high = sorted(sign * end for end in paired.interval())
     return Effect(
         measure=measure.name,
         checkpoint=which,
@@ -231,6 +235,8 @@ def _effect(
         difference=sign * paired.mean,
         low=low,
         high=high,
+        seeds_low=seeds_low,
+        seeds_high=seeds_high,
         p=paired.p_value,
         p_holm=math.nan,
         better=paired.better,

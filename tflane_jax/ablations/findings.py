@@ -36,9 +36,9 @@ def save_effects(
         lines += [
             "",
             "Difference: the claim's model minus the row. From, to: 95 % interval over scenes (seeds averaged,",
-            f"{SAMPLES:,} bootstrap samples, {SHARED_SAMPLES} of scores that rank detections). "
-            "p: two-sided paired t-test",
-            "over seeds; Holm: corrected for all differences of one measure and checkpoint.",
+            f"{SAMPLES:,} bootstrap samples, {SHARED_SAMPLES} of scores that rank detections); seeds from, to: 95 %",
+            "t interval over seeds. Neither is corrected for several claims. p: two-sided paired t-test over seeds;",
+            "Holm: corrected for all differences of one measure and checkpoint.",
         ]
         if no_drives:
             lines.append(f"Remark: {no_drives}: the intervals are too narrow.")
@@ -120,6 +120,7 @@ def _rows(results: Results, declaration: Declaration, test: str, every: Sequence
             place
             | {"model": effect.row, "mean": effect.mean, "std": effect.std}
             | {"difference": effect.difference, "from": effect.low, "to": effect.high}
+            | {"seeds from": effect.seeds_low, "seeds to": effect.seeds_high}
             | {"p": effect.p, "p (Holm)": effect.p_holm}
             | {"seeds better": f"{effect.better} of {len(effect.seeds)}", "finding": effect.finding}
             for effect in group

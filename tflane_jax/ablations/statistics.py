@@ -19,7 +19,8 @@ class PairedDifference:
     Attributes:
         mean: of the differences.
         std: of the differences, with n - 1; NaN for a single seed.
-        p_value: of the two-sided paired t-test for no difference; NaN for a single seed.
+        p_value: of the two-sided paired t-test for no difference; of the sign test if all seeds differ by the same
+            number; NaN for a single seed.
         better: number of seeds in which the treatment is above the control.
         seeds: number of seeds.
     """
@@ -29,6 +30,13 @@ class PairedDifference:
     p_value: float
     better: int
     seeds: int
+
+    def interval(self, level: float = 0.95) -> tuple[float, float]:
+        """Return the t interval of the mean difference over seeds; NaN for a single seed."""
+        from scipy.stats import t
+
+        half = float(t.ppf((1 + level) / 2, self.seeds - 1)) * self.std / math.sqrt(self.seeds)
+        return self.mean - half, self.mean + half
 
 
 def paired_difference(treatment: Float[np.ndarray, " s"], control: Float[np.ndarray, " s"]) -> PairedDifference:
@@ -46,8 +54,9 @@ def paired_difference(treatment: Float[np.ndarray, " s"], control: Float[np.ndar
     if n == 1:
         std = p_value = math.nan
     elif np.ptp(difference) <= _ROUNDING:
-        # The t statistic is 0 / 0 for equal numbers and infinite for a constant shift.
-        std, p_value = 0.0, 1.0 if abs(mean) <= _ROUNDING else 0.0
+        # The t statistic is 0 / 0 for equal numbers and infinite for a constant shift, which scores of counts can
+        # have by chance: the sign test judges it.
+        std, p_value = 0.0, 1.0 if abs(mean) <= _ROUNDING else 2.0 ** (1 - n)
     else:
         std, p_value = float(difference.std(ddof=1)), float(ttest_rel(treatment, control).pvalue)
     return PairedDifference(mean, std, p_value, int((difference > _ROUNDING).sum()), n)

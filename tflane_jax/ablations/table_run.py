@@ -234,6 +234,7 @@ def _save_summary(
             "declared": declared.sentence(),
             "note": table.note,
             "seeds": list(results.seeds),
+            "declared seeds": len(declared.seeds),
             "steps": {name: jobs[0].config.training.steps for name, jobs in trained.items() if jobs},
             "cores of a run": sorted({job.threads["cores"] for job in runs}),
             "commits": sorted(commits) + sorted({text for job in runs for text in _measured_elsewhere(job)}),
@@ -251,5 +252,5 @@ def _measured_elsewhere(job: Job) -> set[str]:
     found = [measure(job, config, which) for config, which in evaluations(job)]
     codes = {measured.code[:9] for measured in found if measured is not None}
     if job.recorded is not None:
-        return {f"recorded by code {code}" for code in codes}
-    return {f"measured by code {code}" for code in codes - {code_digest()[:9]}}
+        return {f"recorded by code of digest {code}" for code in codes}
+    return {f"measured by code of digest {code}" for code in codes - {code_digest()[:9]}}

@@ -109,3 +109,11 @@ def test_the_interval_of_a_mean_has_the_width_that_theory_gives():
 def test_samples_without_anything_to_count_give_zero():
     ratio = resampled_ratio(np.array([[3, 0]]), np.array([4, 0]), np.array([[0, 2], [2, 0]]))
     np.testing.assert_allclose(ratio, [0.0, 0.75])
+
+
+@pytest.mark.parametrize(("looks", "expected"), [((8,), 0.05), ((4, 8), 0.09), ((2, 4, 8), 0.13)])
+def test_looks_before_the_last_seed_add_false_findings(looks, expected):
+    """The rates of docs/comparisons.md, for rows that do not differ."""
+    differences = np.random.default_rng(0).normal(size=(20_000, 8))
+    found = [stats.ttest_1samp(differences[:, :seeds], 0.0, axis=1).pvalue < 0.05 for seeds in looks]
+    assert np.mean(np.any(found, axis=0)) == pytest.approx(expected, abs=0.005)

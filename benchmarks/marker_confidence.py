@@ -102,9 +102,9 @@ def main() -> None:
         inside = (off >= low) & (off < high)
         mean = f"{trust[inside].mean():.3f}" if inside.any() else "-"
         entering = [f"{values[inside].mean():.3f}" if inside.any() else "-" for values in factors.values()]
-        rows.append([f"{low:g} to {high:g} m", f"{inside.mean():.1%}", mean, *entering])
+        rows.append([f"{low:g} to {high:g} m", f"{inside.sum()}", mean, *entering])
     print(f"{len(off)} detections, in the middle {np.median(off):.2f} m off\n")
-    print(markdown_table(["off by", "fraction", "mean confidence", *factors], rows))
+    print(markdown_table(["off by", "detections", "mean confidence", *factors], rows))
 
 
 if __name__ == "__main__":

@@ -175,3 +175,29 @@ def test_a_row_or_a_table_without_its_source_is_found():
     ):
         assert old in page
         assert any(words in line for line in wrong_tables(page.replace(old, new), recorded)[0])
+
+
+# Columns of the tables below `<!-- sweep: NAME -->`: model and score, in the files of docs/sweeps.
+SWEEPS = {
+    "marker_jumps": [
+        (model, score) for score in ("all/DET_l", "seen/recall") for model in ("gated", "uniform", "hard")
+    ],
+    "marker_density": [
+        (model, score)
+        for score in ("all/DET_l", "occluded/recall", "seen/recall", "before/recall")
+        for model in ("gated", "toponet")
+    ],
+}
+
+
+@pytest.mark.parametrize("name", SWEEPS)
+def test_tables_of_sweeps_are_the_recorded_ones(name):
+    page = (ROOT / "docs" / "markers.md").read_text(encoding="utf-8")
+    recorded = json.loads((ROOT / "docs" / "sweeps" / f"{name}.json").read_text(encoding="utf-8"))
+    values, scores = map(float, recorded["meta"]["values"]), recorded["meta"]["scores"]
+    (rows,) = (rows for above, _, rows in tables(page) if above == f"<!-- sweep: {name} -->")
+    for i, (value, (label, *cells)) in enumerate(zip(values, rows, strict=True)):
+        assert float(label.removesuffix(" %")) == pytest.approx(100 * value if "%" in label else value)
+        for (model, score), cell in zip(SWEEPS[name], cells, strict=True):
+            mean = sum(seed[score] for seed in scores[model][i]) / len(scores[model][i])
+            assert _rounds(100 * mean, cell), (label, model, score)

@@ -88,6 +88,11 @@ class HostConfig:
         raise NotImplementedError
 
     @property
+    def wanted_truth(self) -> tuple[str, ...]:
+        """Fields of `truth` that count for `LaneGraphTask.empty_frames`: a frame without any of them is empty."""
+        return self.truth
+
+    @property
     def auxiliary(self) -> tuple[AuxiliaryName, ...]:
         """Auxiliary outputs of the host in training; each has a loss term."""
         return ("lane_cells",) if self.encoder.cells else ()

@@ -112,7 +112,7 @@ def with_torch_heads(variables: Any, key: PRNGKeyArray) -> Any:
     Kernels and biases are uniform within 1 / sqrt(inputs). The published code makes the heads of all layers, and the
     embeddings of traffic elements, by copies of one.
     """
-    params = flatten_dict(variables["params"], sep="/")
+    params: dict[str, Any] = flatten_dict(variables["params"], sep="/")
     for name, leaf in params.items():
         found = _HEADS.fullmatch(name)
         if found is None or (found["lane"] and f"{found['lane']}/class_out/kernel" not in params):

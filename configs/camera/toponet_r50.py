@@ -5,7 +5,10 @@
     tflane train --config camera/toponet_r50 --data.root PATH \\
         --training.init-from runs/imagenet --training.init-partly
 
-The reference trains 24 epochs of 22,477 frames on eight GPUs, one frame each. `:remat` recomputes activations in the
+The reference trains 24 epochs of 22,477 frames on eight GPUs, one frame each, so that class losses are divided by the
+lanes of a frame, and frames without traffic elements have no loss of them. It draws another frame in place of one
+without lanes. Its first release trains on all logs; its configuration of subset B and later copies, as here, leave out
+four whose streets differ from their map. `:remat` recomputes activations in the
 backward pass, `:bfloat16` does so in half precision, `:six_layers` has six encoder layers instead of TopoNet's three.
 `:published_weights` evaluates as the published code does: each frame alone, with the numbers of its pose that the
 weights read (`datasets.openlane_can_bus`), and pixels of all cameras divided by the size of the front camera's crop.
@@ -16,6 +19,8 @@ from pathlib import Path
 
 from tflane_jax.config import OpenLaneV2Data, RunConfig
 from tflane_jax.datasets.photometric import TOPONET_PHOTOMETRIC
+from tflane_jax.losses.toponet import TopoNetLossConfig
+from tflane_jax.losses.traffic_elements import ElementLossConfig
 from tflane_jax.models.camera_encoder import PAPER_CAMERA_ENCODER, CameraEncoderConfig
 from tflane_jax.models.toponet import paper_config
 from tflane_jax.tasks.lane_graph import LaneGraphTask
@@ -31,9 +36,10 @@ ENCODER = replace(PAPER_CAMERA_ENCODER, bev=replace(PAPER_CAMERA_ENCODER.bev, ca
 
 def get_config() -> RunConfig:
     """Return the paper's configuration."""
+    losses = TopoNetLossConfig(class_mean="frame", elements=ElementLossConfig(empty_frames="skip"))
     return RunConfig(
-        task=LaneGraphTask(replace(paper_config(), encoder=ENCODER)),
-        data=OpenLaneV2Data(Path("data/OpenLane-V2"), augmentation=TOPONET_PHOTOMETRIC),
+        task=LaneGraphTask(replace(paper_config(), encoder=ENCODER), losses, empty_frames="skip"),
+        data=OpenLaneV2Data(Path("data/OpenLane-V2"), augmentation=TOPONET_PHOTOMETRIC, map_changes="drop"),
         optim=OptimConfig(
             decayed="all", epoch_steps=EPOCH, ema_decay=0.0, lr_factors=(("encoder/images/backbone", 0.1),)
         ),
@@ -44,10 +50,12 @@ def get_config() -> RunConfig:
 def ablations() -> dict[str, RunConfig]:
     """Return variants of the encoder, and the published weights' inputs."""
     config = get_config()
+    task = config.task
     assert isinstance(config.data, OpenLaneV2Data)
+    assert isinstance(task, LaneGraphTask)
 
     def with_encoder(encoder: CameraEncoderConfig) -> RunConfig:
-        return replace(config, task=LaneGraphTask(replace(paper_config(), encoder=encoder)))
+        return replace(config, task=replace(task, model=replace(task.model, encoder=encoder)))
 
     images, bev = replace(ENCODER.images, remat=True), replace(ENCODER.bev, remat=True)
     alone = replace(ENCODER, bev=replace(ENCODER.bev, memory="off", motion="can_bus", image_size="first"))

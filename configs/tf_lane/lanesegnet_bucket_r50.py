@@ -16,6 +16,8 @@ from pathlib import Path
 from tflane_jax.config import OpenLaneV2Data, RunConfig, load_ablations, load_config, with_remat
 from tflane_jax.datasets.photometric import LANESEGNET_BUCKET_PHOTOMETRIC
 from tflane_jax.datasets.view_images import LANESEGNET_BUCKET
+from tflane_jax.losses.lanesegnet import LaneSegNetLossConfig
+from tflane_jax.losses.traffic_elements import ElementLossConfig
 from tflane_jax.models.area_decoder import PAPER_AREA_DECODER
 from tflane_jax.models.lanesegnet import LaneSegNetConfig, paper_bucket_config
 from tflane_jax.tasks.lane_graph import LaneGraphTask
@@ -45,7 +47,9 @@ def _bucket(model: LaneSegNetConfig) -> RunConfig:
     assert isinstance(config.task, LaneGraphTask)
     assert isinstance(six_layers.task, LaneGraphTask)
     assert isinstance(config.data, OpenLaneV2Data)
-    task = replace(config.task, model=replace(model, encoder=six_layers.task.model.encoder))
+    assert isinstance(config.task.losses, LaneSegNetLossConfig)
+    losses = replace(config.task.losses, elements=ElementLossConfig(empty_frames="skip"))
+    task = replace(config.task, model=replace(model, encoder=six_layers.task.model.encoder), losses=losses)
     example = replace(config.data.example, crossings="ring")
     data = replace(config.data, image=LANESEGNET_BUCKET, example=example, augmentation=LANESEGNET_BUCKET_PHOTOMETRIC)
     return replace(config, task=task, data=data, training=replace(config.training, best_metric="all/OLUS"))

@@ -42,13 +42,13 @@ def _segments(toponet: RunConfig, model: LaneSegNetConfig) -> RunConfig:
     assert isinstance(toponet.task, LaneGraphTask)
     assert isinstance(toponet.data, OpenLaneV2Data)
     model = replace(model, encoder=toponet.task.model.encoder)
-    task = LaneGraphTask(model, LaneSegNetLossConfig(raster="published"), empty_frames="skip")
+    losses = LaneSegNetLossConfig(raster="published", class_mean="frame")
+    task = LaneGraphTask(model, losses, empty_frames="skip")
     example = replace(toponet.data.example, crossings="sides")
     data = replace(
         toponet.data,
         flavour="lane_segment",
         example=example,
         augmentation=LANESEGNET_PHOTOMETRIC,
-        map_changes="drop",
     )
     return replace(toponet, task=task, data=data, training=replace(toponet.training, best_metric="all/mAP"))

@@ -118,6 +118,25 @@ def test_a_grid_has_one_period_and_hides_half_of_it(seed):
         assert len(set(widths[::2].tolist())) <= 1
 
 
+@pytest.mark.parametrize("seed", range(20))
+def test_a_grid_has_as_many_stripes_as_fit_into_the_larger_canvas(seed):
+    """Regression: stripes went on for ever, and hid 25 instead of 27 percent of the pixels."""
+    height, width = 60, 90
+    grid = draw_grid(replace(NOTHING, grid_mask=1.0), np.random.default_rng(seed), height, width)
+    _, period, *starts = np.random.default_rng(seed).uniform(size=4)
+    period = 2 + int(period * (height - 2))
+    kept = min(max(int(period / 2 + 0.5), 1), period - 1)
+    hidden = []
+    for size, start in zip((height, width), starts, strict=True):
+        whole = int(1.5 * size)
+        line = np.ones(whole, bool)
+        for stripe in range(whole // period):
+            first = period * stripe + int(start * period)
+            line[first : first + kept] = False
+        hidden.append(line[(whole - size) // 2 :][:size])
+    np.testing.assert_array_equal(grid, hidden[0][:, None] & hidden[1])
+
+
 def test_a_grid_is_drawn_with_its_probability():
     config = PhotometricConfig(grid_mask=0.7)
     drawn = [draw_grid(config, np.random.default_rng(seed), 50, 50) for seed in range(300)]

@@ -23,6 +23,7 @@ from tflane_jax.losses.lanesegnet import (
     segment_quality,
     successor_loss,
 )
+from tflane_jax.losses.traffic_elements import ElementLossConfig
 from tflane_jax.matching import Assignment, match
 from tflane_jax.models.auxiliary import AuxiliaryOutputs
 from tflane_jax.models.segment_truth import CROSSING, LANE
@@ -254,7 +255,22 @@ def test_padding_of_the_examples_may_hold_nan():
     assert np.isfinite(clean[0])
 
 
-def test_elements_count_as_matched_pairs_and_not_at_all_in_a_batch_without_any():
+def test_published_class_losses_are_divided_by_the_rows_of_their_own_frame():
+    """Classes, line types and topology, as of devices with one frame each; the other terms as of one batch."""
+    case = make_case(counts=(2, 4, 1))
+    config = LaneSegNetLossConfig(class_mean="frame")
+    alone = [
+        jitted(*jax.tree.map(lambda leaf, i=i: leaf[i : i + 1], case), LaneSegNetLossConfig())[1] for i in range(3)
+    ]
+    report, batch = (jitted(*case, each)[1] for each in (config, LaneSegNetLossConfig()))
+    for name in ("class", "line_type", "successor"):
+        np.testing.assert_allclose(report[name], np.mean([terms[name] for terms in alone]), rtol=1e-5, err_msg=name)
+        assert abs(float(report[name] - batch[name])) > 0.02 * float(batch[name]), name
+    for name in ("points", "mask", "dice"):
+        np.testing.assert_array_equal(report[name], batch[name])
+
+
+def test_elements_count_as_matched_pairs_and_not_at_all_in_a_frame_without_any():
     """The map-element-bucket variant: its topology has the loss of the successors."""
     host = replace(SEGMENTS, decoder=replace(SEGMENTS.decoder, classes=1))
     example, none = make_bucket_example(0), make_bucket_example(0, elements=0)
@@ -263,7 +279,7 @@ def test_elements_count_as_matched_pairs_and_not_at_all_in_a_batch_without_any()
     lines, types = [draw(6, points, 3) for _ in range(3)], [draw(6, 3) for _ in range(2)]
     segments = SegmentPrediction(*lines, draw(6, 1), *types, draw(6, *CELLS), draw(6, 6))
     outputs = Prediction(segments=segments, elements=ElementPrediction(draw(5, 2, 2), draw(5, 13), draw(6, 5)))
-    config = LaneSegNetLossConfig(matcher="scipy")
+    config = LaneSegNetLossConfig(matcher="scipy", elements=ElementLossConfig(empty_frames="skip"))
 
     @jax.jit
     def run(batch):

@@ -86,6 +86,22 @@ def test_matches_plain_loops(counts):
     assert float(report["matching/lanes"]) == pytest.approx(np.mean(counts))
 
 
+def test_published_class_losses_are_divided_by_the_lanes_of_their_own_frame():
+    """Devices with one frame each, averaged: only the class loss differs from that of one batch."""
+    prediction, truth = make_case(counts=(3, 5, 0))
+    config = dataclasses.replace(CONFIG, class_mean="frame")
+    alone = [
+        jitted_loss(*jax.tree.map(lambda leaf, i=i: leaf[i : i + 1], (prediction, truth)), CONFIG)[1] for i in range(3)
+    ]
+    loss, report = jitted_loss(prediction, truth, config)
+    whole, batch = jitted_loss(prediction, truth, CONFIG)
+    np.testing.assert_allclose(report["class"], np.mean([terms["class"] for terms in alone]), rtol=1e-5)
+    assert abs(float(report["class"] - batch["class"])) > 0.1 * float(batch["class"])
+    assert float(loss) != pytest.approx(float(whole), rel=1e-3)
+    for name in ("points", "successor"):
+        np.testing.assert_array_equal(report[name], batch[name])
+
+
 def test_padding_changes_nothing():
     prediction, lanes = make_case(2)
     hole = ~lanes.valid

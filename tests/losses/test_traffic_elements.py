@@ -12,6 +12,7 @@ from tests.losses.test_toponet import BATCH, LAYERS, QUERIES, focal, make_case
 from tflane_jax.geometry.bezier import bezier_fit
 from tflane_jax.losses.costs import generalised_iou
 from tflane_jax.losses.toponet import TopoNetLossConfig, lane_graph_loss, matching_cost
+from tflane_jax.losses.traffic_elements import ElementLossConfig
 from tflane_jax.scene import ElementPrediction, Prediction, TrafficElements, stack_examples
 
 ELEMENTS, FOUND = 3, 4
@@ -168,6 +169,21 @@ def test_order_of_queries_lanes_and_elements_is_free():
     for part, order in (("centerlines", query), ("elements", box)):
         own, same = getattr(gradient, part).logits[:, :, order], getattr(turned, part).logits
         np.testing.assert_allclose(same, own, rtol=1e-4, atol=1e-6)
+
+
+def test_frames_without_elements_have_no_loss_of_elements_where_that_is_skipped():
+    """As in the published training; their lanes still learn that no element governs them."""
+    prediction, lanes, elements = make_elements(1, (2, 0, 1), related=LAYERS)
+    skip = TopoNetLossConfig(elements=ElementLossConfig(empty_frames="skip"))
+    (_, keep), gradient = value_and_gradient(prediction, lanes, elements, SIZES, TopoNetLossConfig())
+    (_, report), skipped = value_and_gradient(prediction, lanes, elements, SIZES, skip)
+    assert np.any(gradient.elements.logits[1])
+    assert not np.any(skipped.elements.logits[1])
+    for frame in (0, 2):
+        np.testing.assert_allclose(skipped.elements.logits[frame], gradient.elements.logits[frame], rtol=1e-6)
+    assert float(report["element_class"]) < float(keep["element_class"])
+    for name in ("element_box", "element_iou", "element_lane", "class"):
+        np.testing.assert_array_equal(report[name], keep[name])
 
 
 def test_no_room_for_elements_equals_no_elements():

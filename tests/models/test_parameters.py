@@ -1,6 +1,7 @@
 """Initial values of whole hosts: a published form of every kind of host can be initialised for training."""
 
 import dataclasses
+import functools
 
 import jax
 import numpy as np
@@ -21,8 +22,9 @@ from tests.models.cases import (
     make_line_example,
 )
 from tests.slow import with_slow
+from tflane_jax.models import host
 from tflane_jax.models.area_decoder import AreaDecoderConfig
-from tflane_jax.models.parameters import with_xavier_layers
+from tflane_jax.models.parameters import with_torch_heads, with_xavier_layers
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 
 BUCKET = dataclasses.replace(
@@ -79,3 +81,87 @@ def test_the_scene_graph_starts_within_torchs_bounds(path, shape, bound):
     drawn = np.asarray(flatten_dict(params["params"], sep="/")[path])
     assert 0.99 * bound < np.abs(drawn).max() <= bound
     assert abs(drawn.mean()) < 0.05 * bound
+
+
+@functools.cache
+def started(name: str) -> dict[str, np.ndarray]:
+    """Return the published start of a host's own heads, drawn over parameters that are 1 everywhere."""
+    config, make = HOSTS[name]
+    shapes = jax.eval_shape(LaneGraphTask(config).init, jax.random.key(0), make())
+    ones = jax.tree.map(lambda leaf: np.ones(leaf.shape, np.float32), dict(shapes))
+    drawn = with_torch_heads({"params": ones}, jax.random.key(1))["params"]
+    return {path: np.asarray(leaf) for path, leaf in flatten_dict(drawn, sep="/").items()}
+
+
+RELATION = [
+    *(f"{side}/linear_{i}" for side in ("mlp_first", "mlp_second") for i in range(3)),
+    *("pair_first", "pair_second", "pair_hidden", "pair_out"),
+]
+ELEMENT_HEADS = [
+    f"elements/{name}" for i in range(2) for name in (f"class_{i}", *(f"box_{i}/hidden/linear_{k}" for k in range(2)))
+]
+LANE_HEADS = ["class_0", "class_1", "class_out", "points/linear_0", "points/linear_1", "points/linear_2"]
+DRAWN = {
+    "toponet": [
+        *(f"heads_{i}/{name}" for i in range(2) for name in LANE_HEADS),
+        *(f"heads_{i}/{edge}/{name}" for i in range(2) for edge in ("successor", "element_lane") for name in RELATION),
+        *(f"element_embedding_{i}/{name}" for i in range(2) for name in ("expand", "contract")),
+        *ELEMENT_HEADS,
+    ],
+    "bevformer_detr": [
+        *(f"heads_{i}/{name}" for i in range(2) for name in LANE_HEADS),
+        *(f"heads_1/{edge}/{name}" for edge in ("successor", "element_lane") for name in RELATION),
+        *ELEMENT_HEADS,
+    ],
+    "lanesegnet": [*(f"{edge}/{name}" for edge in ("successor", "element_lane") for name in RELATION), *ELEMENT_HEADS],
+    "maptr": [],
+}
+
+
+@pytest.mark.parametrize("name", DRAWN)
+def test_published_heads_start_as_in_torch(name):
+    """torch.nn.Linear: kernel and bias within 1 / sqrt(inputs); the focal class biases and the boxes' last layer stay.
+
+    The heads of LaneSegNet and MapTR draw such values themselves.
+    """
+    params = started(name)
+    biases = ("heads_0/class_out", "heads_1/class_out", "elements/class_0", "elements/class_1")
+    wanted = {f"{module}/kernel" for module in DRAWN[name]}
+    wanted |= {f"{module}/bias" for module in DRAWN[name] if module not in biases and "pair_second" not in module}
+    assert {path for path, leaf in params.items() if np.any(leaf != 1.0)} == wanted
+    for path in wanted:
+        inputs = len(params[path.rpartition("/")[0] + "/kernel"]) * (
+            2 if "/pair_" in path and "hidden" not in path else 1
+        )
+        if "pair_out" in path:
+            inputs //= 2
+        bound = inputs**-0.5
+        assert np.abs(params[path]).max() <= bound, path
+        if params[path].size > 30:
+            assert np.abs(params[path]).max() > 0.85 * bound, path
+
+
+@pytest.mark.parametrize("name", ["toponet", "bevformer_detr"])
+def test_published_heads_are_equal_in_all_layers_and_differ_from_one_another(name):
+    params = started(name)
+    layers = {
+        path: path.replace("_0/", "_1/", 1) for path in params if path.startswith(("heads_0", "element_embedding_0"))
+    }
+    layers |= {
+        path: path.replace("_0/", "_1/", 1)
+        for path in params
+        if path.startswith(("elements/class_0", "elements/box_0"))
+    }
+    for first, second in layers.items():
+        np.testing.assert_array_equal(params[first], params[second])
+    heads = params["heads_1/successor/mlp_first/linear_0/kernel"], params["heads_1/successor/mlp_first/linear_1/kernel"]
+    assert not np.array_equal(*heads)
+    assert not np.array_equal(heads[0], params["heads_1/element_lane/mlp_first/linear_0/kernel"])
+
+
+def test_a_host_draws_its_heads_where_the_configuration_says_so(monkeypatch):
+    monkeypatch.setattr(host, "with_torch_heads", lambda variables, key: {**variables, "drawn": key})
+    for initial in ("lecun", "xavier"):
+        module = dataclasses.replace(CAMERA_TOPONET, initial=initial).build()
+        shapes = jax.eval_shape(module.init, jax.random.key(0), make_camera_example())
+        assert ("drawn" in shapes) == (initial == "xavier")

@@ -9,7 +9,14 @@ import numpy as np
 import pytest
 
 from tests.fakes import fake_prediction
-from tests.models.cases import BASELINE, WITH_TRAFFIC, make_example, make_line_example
+from tests.models.cases import (
+    BASELINE,
+    SEGMENTS,
+    WITH_TRAFFIC,
+    make_example,
+    make_line_example,
+    make_segment_example,
+)
 from tests.parameters import random_params
 from tests.priors.test_traffic_flow import make_flow
 from tflane_jax.config import RunConfig, WorldData, load_config
@@ -240,3 +247,12 @@ def test_an_evaluation_keeps_recall_as_counts_by_scene(monkeypatch):
     config, task = EvaluationConfig(batch_size=2), LaneGraphTask(BASELINE)
     evaluation = task.evaluate({}, stack_examples([make_example()]), config)
     assert {f"{group}/recall" for group in ("all", *LANE_GROUPS)} < set(evaluation.ratios) < set(evaluation.scores())
+
+
+@pytest.mark.parametrize(("areas", "kept"), [(None, 2), (AreaDecoderConfig(), 1)])
+def test_a_frame_with_crossings_alone_is_empty_where_crossings_are_areas(areas, kept):
+    """The rule of LaneSegNet's loader: rows of segments count, and crossings are such rows in one form only."""
+    task = LaneGraphTask(replace(SEGMENTS, areas=areas), empty_frames="skip")
+    frames = [make_segment_example(lanes=lanes, crossings=1 - bool(lanes)) for lanes in (0, 3)]
+    frames.append(make_segment_example(lanes=0, crossings=0))
+    assert len(task.examples(stack_examples(frames)).has_previous) == kept

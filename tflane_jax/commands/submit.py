@@ -104,6 +104,7 @@ def _record(dataset: OpenLaneV2Dataset, answer: Prediction) -> dict[str, Any]:
         boxes = dataset.in_files(np.asarray(elements.box))
         elements = elements.replace(box=boxes)  # pyright: ignore[reportAttributeAccessIssue]
     if answer.segments is not None:
-        return segment_record(detections_of_segments(answer.segments, elements))
+        crossings = "sides" if answer.segments.areas is None else "ring"
+        return segment_record(detections_of_segments(answer.segments, elements), crossings)
     assert answer.centerlines is not None
     return centerline_record(detections_of_centerlines(answer.centerlines, elements))

@@ -189,9 +189,14 @@ MAP_CHANGES = frozenset(
         "54bc6dbc-ebfb-3fba-b5b3-57f88b4b79ca",
         "af170aac-8465-3d7b-82c5-64147e94af7d",
         "6e106cf8-f6dd-38f6-89c8-9be7a71e7275",
+        "a6daedc3063b421cb3a05019e545f925",
+        "02f1e5e2fc544798aad223f5ae5e8440",
+        "55638ae3a8b34572aef756ee7fbce0df",
+        "20ec831deb0f44e397497198cbe5a97c",
     )
 )
-"""Logs of subset A whose streets differ from their map; LaneSegNet does not train on them."""
+"""Logs whose streets differ from their map, four of subset A and four of subset B. LaneSegNet, TopoNet on subset B and
+later copies of TopoNet do not train on them; TopoNet's first release on subset A does."""
 
 
 def without_map_changes(root: Path, keys: Sequence[FrameKey], suffix: str = "") -> list[FrameKey]:

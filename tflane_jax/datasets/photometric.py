@@ -137,15 +137,23 @@ def draw_grid(
 ) -> Bool[np.ndarray, "h w"] | None:
     """Return which pixels a grid of squares hides, or None for no grid.
 
-    The period is between 2 pixels and the image's height. A pixel is hidden if both its row and its column lie outside
-    the visible fraction of the period.
+    The period is between 2 pixels and the image's height. Visible stripes of rows and of columns begin once a period,
+    as many as fit into 1.5 times the image; a pixel is hidden if it is in no stripe of either kind. As in TopoNet's
+    code, a long period leaves rows before the first stripe or behind the last one.
     """
     chance, period, row, column = rng.uniform(size=4)
     if chance >= config.grid_mask or height < 3:
         return None
     period = 2 + int(period * (height - 2))
-    kept = min(max(round(period * config.grid_ratio), 1), period - 1)
+    kept = min(max(int(period * config.grid_ratio + 0.5), 1), period - 1)
     rows, columns = (
-        (np.arange(size) + int(start * period)) % period >= kept for size, start in ((height, row), (width, column))
+        _between_stripes(size, period, kept, int(start * period)) for size, start in ((height, row), (width, column))
     )
     return rows[:, None] & columns
+
+
+def _between_stripes(size: int, period: int, kept: int, start: int) -> Bool[np.ndarray, " size"]:
+    """Return which of `size` pixels lie in no stripe; the stripes begin at `start` in 1.5 times the size, centred."""
+    whole = int(1.5 * size)
+    at = np.arange(size) + (whole - size) // 2 - start
+    return (at < 0) | (at >= whole // period * period) | (at % period >= kept)

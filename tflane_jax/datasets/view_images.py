@@ -7,7 +7,7 @@ The presets are those of the published code: TopoNet (https://github.com/OpenDri
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -27,18 +27,21 @@ class ImageConfig:
         front_size: width and height to which the front image is stretched; None does not stretch it.
         scale: factor on width and height of every image, rounded down to whole pixels.
         divisor: width and height of the array that holds all images are multiples of it.
+        shrink: how images become smaller than half their size: by averages over "area", or "bilinear", which skips
+            pixels.
     """
 
     front_rows: Annotated[tuple[CountOrZero, Count], INCREASING] | None = None
     front_size: tuple[Count, Count] | None = None
     scale: Factor = 1.0
     divisor: Count = 32
+    shrink: Literal["area", "bilinear"] = "area"
 
 
 TOPONET_SUBSET_A = ImageConfig(front_rows=(356, 1906), scale=0.5)
 """TopoNet, LaneSegNet and TF-Lane on Argoverse 2: 7 images of 1024 x 775 (the front one 775 x 775) in 1024 x 800."""
-LANESEGNET_BUCKET = ImageConfig(front_rows=(356, 1906), scale=0.33)
-"""LaneSegNet's map-element-bucket variant on Argoverse 2: 7 images of 675 x 511 (the front one 511 x 511)."""
+LANESEGNET_BUCKET = ImageConfig(front_rows=(356, 1906), scale=0.33, shrink="bilinear")
+"""LaneSegNet's map-element-bucket variant on Argoverse 2: 7 images of 675 x 511 (the front one 511 x 511), bilinear."""
 TOPONET_SUBSET_B = ImageConfig(scale=0.5)
 """TopoNet on nuScenes: 6 images of 800 x 450 in 800 x 480."""
 BASELINE_LARGE = ImageConfig(front_size=(2048, 1550))
@@ -53,11 +56,13 @@ class ImageFit:
         source: width and height of the files, pixels.
         rows: rows [first, last) of the files that are kept.
         size: width and height of the result, pixels.
+        shrink: see `ImageConfig`.
     """
 
     source: tuple[int, int]
     rows: tuple[int, int]
     size: tuple[int, int]
+    shrink: Literal["area", "bilinear"] = "area"
 
     @property
     def scale(self) -> tuple[float, float]:
@@ -65,9 +70,9 @@ class ImageFit:
         return self.size[0] / self.source[0], self.size[1] / (self.rows[1] - self.rows[0])
 
     def image(self, image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "height width 3"]:
-        """Return the resized image: area averages below half size, else bilinear."""
+        """Return the resized image: bilinear, or area averages below half size."""
         cv2 = opencv()
-        kind = cv2.INTER_AREA if min(self.scale) < 0.5 else cv2.INTER_LINEAR
+        kind = cv2.INTER_AREA if self.shrink == "area" and min(self.scale) < 0.5 else cv2.INTER_LINEAR
         part = image[self.rows[0] : self.rows[1]]
         return part if part.shape[1::-1] == self.size else cv2.resize(part, self.size, interpolation=kind)
 
@@ -78,7 +83,8 @@ class ImageFit:
     def boxes(self, boxes: Float[np.ndarray, "e 2 2"]) -> Float[np.ndarray, "e 2 2"]:
         """Return boxes (top-left and bottom-right corners) in the result, clipped at its border.
 
-        A box that lies wholly outside gets zero area.
+        A box that lies wholly outside gets zero area. TopoNet's code clips no true box and drops only those above the
+        rows that are kept; it clamps predicted boxes to the image, which are left as they are here.
         """
         return np.clip((boxes - (0.0, self.rows[0])) * self.scale, 0.0, self.size)
 
@@ -104,7 +110,7 @@ def fit_image(width: int, height: int, config: ImageConfig, *, front: bool) -> I
     size = (int(stretched[0] * config.scale), int(stretched[1] * config.scale))
     if min(size) < 1:
         raise UserError(f"ImageConfig.scale = {config.scale} leaves nothing of an image of {width} x {height} pixels")
-    return ImageFit((width, height), rows, size)
+    return ImageFit((width, height), rows, size, config.shrink)
 
 
 def canvas_size(sizes: list[tuple[int, int]], divisor: int) -> tuple[int, int]:

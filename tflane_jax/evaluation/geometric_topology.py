@@ -22,7 +22,7 @@ _MOST = 1.0 - 1e-7
 def geometric_edges(points: Float[np.ndarray, "q p 3"]) -> Float[np.ndarray, "q q"]:
     """Return exp(-d^2 / `SCALE`), d the L1 distance from the end of lane i to the start of lane j in metres.
 
-    A lane does not follow itself.
+    As in TopoLogic, it is 0 for a lane and itself.
     """
     ends, starts = np.asarray(points)[:, -1], np.asarray(points)[:, 0]
     distance = np.abs(ends[:, None] - starts[None]).sum(-1)
@@ -30,7 +30,10 @@ def geometric_edges(points: Float[np.ndarray, "q p 3"]) -> Float[np.ndarray, "q 
 
 
 def with_geometric_topology(prediction: Prediction) -> Prediction:
-    """Return the prediction of one example, last layer, whose edges have the sum of both scores, at most 1.
+    """Return the prediction of one example, last layer, whose edges have the sum of both scores, as a confidence.
+
+    TopoLogic evaluates the sum s itself, which is up to 2. Metrics take confidences up to 1 and read their order and
+    whether they are above 0.5: s above 0.5 becomes 0.5 + (s - 0.5) / 3, which keeps both.
 
     Lanes without predicted topology, and vector maps, stay as they are.
     """
@@ -43,4 +46,5 @@ def with_geometric_topology(prediction: Prediction) -> Prediction:
 
 
 def _added(points: Float[np.ndarray, "q p 3"], logits: Float[np.ndarray, "q q"]) -> Float[np.ndarray, "q q"]:
-    return logit(np.minimum(expit(np.asarray(logits, np.float64)) + geometric_edges(points), _MOST))
+    both = expit(np.asarray(logits, np.float64)) + geometric_edges(points)
+    return logit(np.minimum(np.where(both <= 0.5, both, 0.5 + (both - 0.5) / 3.0), _MOST))

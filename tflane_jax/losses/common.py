@@ -20,6 +20,8 @@ Terms = dict[str, Float[Array, " layers"]]
 """Weighted loss terms by name, one value for each decoder layer."""
 Report = dict[str, Float[Array, ""]]
 """Numbers to record: the last layer's terms, and counts."""
+ClassMean = Literal["frame", "batch"]
+"""What the class losses are divided by, see `over_matched`."""
 
 
 @dataclass(frozen=True)
@@ -174,6 +176,23 @@ def last_layers(assignment: Assignment, layers: int) -> Assignment:
 def positives(assignment: Assignment) -> Float[Array, " layers"]:
     """Return the number of matched queries of a batch per layer, at least 1; published code divides sums by it."""
     return jnp.maximum(assignment.matched.sum((0, 2)).astype(jnp.float32), 1.0)
+
+
+def over_matched(
+    weight: float, sums: Float[Array, "b layers"], assignment: Assignment, mean: ClassMean
+) -> Float[Array, " layers"]:
+    """Return weighted sums over the queries of each example, divided by numbers of matched queries, for each layer.
+
+    Args:
+        weight: of the term.
+        sums: of the class losses.
+        assignment: (B, D, N).
+        mean: "batch": all sums are divided by `positives`. "frame": each sum by the number of its own example, at least
+            1, and the quotients are averaged, as published code with one example on each device does.
+    """
+    if mean == "batch":
+        return weight * sums.sum(0) / positives(assignment)
+    return weight * (sums / jnp.maximum(assignment.matched.sum(2).astype(jnp.float32), 1.0)).mean(0)
 
 
 def matched(assignment: Assignment) -> Float[Array, ""]:

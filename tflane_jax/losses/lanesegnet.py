@@ -22,6 +22,7 @@ from tflane_jax.limits import Fraction, PositiveOrZero
 from tflane_jax.losses.areas import AreaLossConfig, area_loss
 from tflane_jax.losses.auxiliary import auxiliary_losses, denoising_pairs
 from tflane_jax.losses.common import (
+    ClassMean,
     HostLossConfig,
     Report,
     Terms,
@@ -29,7 +30,7 @@ from tflane_jax.losses.common import (
     last_layer,
     matched,
     matched_edge_sums,
-    positives,
+    over_matched,
     total,
 )
 from tflane_jax.losses.costs import dice_cost, focal_cost, mask_cost, pairwise_l1
@@ -67,6 +68,9 @@ class LaneSegNetLossConfig(HostLossConfig):
             pairs without an edge, as in the published code, or of all "pairs".
         raster: of the mask targets.
         class_target: of a query matched with a segment: "one", or "quality" (`segment_quality`).
+        class_mean: the losses of classes and line types are divided by the matched rows, and those of both topologies
+            by the pairs, of each "frame", as in the published training, or of the "batch", see
+            `losses.common.over_matched`.
         proposal_weight: of the heat map of proposals; their shapes have `points_weight`.
         elements, areas: weights of traffic elements and of areas, where the model predicts them.
         cell_weight: see `HostLossConfig`.
@@ -86,6 +90,7 @@ class LaneSegNetLossConfig(HostLossConfig):
     successor_mean: Literal["negatives", "pairs"] = "negatives"
     raster: Raster = "cells"
     class_target: Literal["one", "quality"] = "one"
+    class_mean: ClassMean = "batch"
     proposal_weight: PositiveOrZero = 1.5
     elements: ElementLossConfig = ElementLossConfig()
     areas: AreaLossConfig = AreaLossConfig()
@@ -130,10 +135,7 @@ class LaneSegNetLossConfig(HostLossConfig):
     def _element_loss(
         self, prediction: ElementPrediction, segments: Assignment, targets: SegmentTargets, batch: Example
     ) -> tuple[Float[Array, ""], Report]:
-        """Return the loss of traffic elements and of their topology with the segments, and its terms.
-
-        Both are 0 for a batch without elements, as in the published code.
-        """
+        """Return the loss of traffic elements and of their topology with the segments, and its terms."""
         elements, size = true_elements(batch)
         elements = clear_padding(elements)
         found = assign_elements(prediction, elements, size, self.elements, self.matcher)
@@ -147,9 +149,7 @@ class LaneSegNetLossConfig(HostLossConfig):
             (self.alpha, self.gamma),
             self.successor_mean,
         )
-        terms["element_lane"] = (self.element_lane_weight * losses.sum() / jnp.maximum(counts.sum(), 1.0))[None]
-        there = elements.valid.any()
-        terms = {name: jnp.where(there, term, 0.0) for name, term in terms.items()}
+        terms["element_lane"] = _pair_mean(self.element_lane_weight, losses, counts, self.class_mean)[None]
         return total(terms), last_layer(terms) | {"matching/elements": matched(found)}
 
 
@@ -226,7 +226,6 @@ def segment_losses(
     layers = replace(prediction, successor_logits=None, areas=None)
     each = jax.vmap(partial(_layer_sums, config=config), in_axes=(0, 0, None, None))
     sums = jax.vmap(each)(layers, assignment, targets, masks)  # each (B, D)
-    count = positives(assignment)
     weights = {
         "class": config.class_weight,
         "points": config.points_weight,
@@ -234,7 +233,10 @@ def segment_losses(
         "dice": config.dice_weight,
         "line_type": config.type_weight,
     }
-    terms = {name: weight * sums[name].sum(0) / count for name, weight in weights.items()}
+    by: dict[str, ClassMean] = {"class": config.class_mean, "line_type": config.class_mean}
+    terms = {
+        name: over_matched(weight, sums[name], assignment, by.get(name, "batch")) for name, weight in weights.items()
+    }
     edges = jnp.asarray(prediction.successor_logits)[:, -1]
     return terms | {"successor": successor_loss(edges, _last(assignment), targets, config)[None]}
 
@@ -289,7 +291,16 @@ def successor_loss(
     losses, counts = matched_edge_sums(
         logits, lanes, lanes, targets.successor, (config.alpha, config.gamma), config.successor_mean
     )
-    return config.successor_weight * losses.sum() / jnp.maximum(counts.sum(), 1.0)
+    return _pair_mean(config.successor_weight, losses, counts, config.class_mean)
+
+
+def _pair_mean(
+    weight: float, losses: Float[Array, " b"], counts: Float[Array, " b"], mean: ClassMean
+) -> Float[Array, ""]:
+    """Return the weighted sums of `matched_edge_sums`, divided by the counts of the batch or of each frame."""
+    if mean == "batch":
+        return weight * losses.sum() / jnp.maximum(counts.sum(), 1.0)
+    return weight * (losses / jnp.maximum(counts, 1.0)).mean()
 
 
 def _last(assignment: Assignment) -> Assignment:

@@ -19,6 +19,7 @@ from tflane_jax.geometry.bezier import bezier_fit
 from tflane_jax.limits import Fraction, PositiveOrZero
 from tflane_jax.losses.auxiliary import auxiliary_losses, denoising_pairs
 from tflane_jax.losses.common import (
+    ClassMean,
     HostLossConfig,
     Report,
     Terms,
@@ -27,7 +28,7 @@ from tflane_jax.losses.common import (
     last_layer,
     last_layers,
     matched,
-    positives,
+    over_matched,
     total,
 )
 from tflane_jax.losses.costs import focal_cost, pairwise_l1
@@ -62,6 +63,8 @@ class TopoNetLossConfig(HostLossConfig):
         elements: weights for traffic elements.
         class_target: of a query matched with a lane: "one", or "quality", which falls with its distance from the lane
             (`lane_quality`), so that scores rank lanes by their precision (Li et al. 2020, quality focal loss).
+        class_mean: the class loss is divided by the matched lanes of each "frame", as in the published training, or of
+            the "batch", see `losses.common.over_matched`.
         proposal_weight: of the heat map of lane proposals; their shapes have `points_weight`.
         cell_weight: see `HostLossConfig`.
     """
@@ -75,6 +78,7 @@ class TopoNetLossConfig(HostLossConfig):
     element_lane_weight: PositiveOrZero = 5.0
     elements: ElementLossConfig = ElementLossConfig()
     class_target: Literal["one", "quality"] = "one"
+    class_mean: ClassMean = "batch"
     proposal_weight: PositiveOrZero = 1.5
 
     def loss(
@@ -196,10 +200,9 @@ def lane_losses(
         raise ValueError("this loss needs a host that predicts topology (successor_logits)")
     related = last_layers(assignment, prediction.successor_logits.shape[1])
     successors = edge_loss(prediction.successor_logits, related, related, edges, config.alpha, config.gamma)
-    count = positives(assignment)
     return {
-        "class": config.class_weight * classes.sum(0) / count,
-        "points": config.points_weight * points.sum(0) / count,
+        "class": over_matched(config.class_weight, classes, assignment, config.class_mean),
+        "points": over_matched(config.points_weight, points, assignment, "batch"),
         "successor": config.successor_weight * successors,
     }
 

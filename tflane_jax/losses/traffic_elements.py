@@ -28,6 +28,8 @@ class ElementLossConfig:
     Attributes:
         class_weight, box_weight, iou_weight: of class, L1 and generalised IoU.
         alpha, gamma: parameters of the focal terms.
+        empty_frames: frames without elements. "keep": their queries are negatives of the class loss; "skip": they have
+            no loss, as in the published training, where every device has one frame.
     """
 
     class_weight: PositiveOrZero = 1.0
@@ -35,6 +37,7 @@ class ElementLossConfig:
     iou_weight: PositiveOrZero = 1.0
     alpha: Fraction = 0.25
     gamma: PositiveOrZero = 2.0
+    empty_frames: Literal["keep", "skip"] = "keep"
 
 
 def clear_padding(elements: TrafficElements) -> TrafficElements:
@@ -99,6 +102,8 @@ def element_losses(
     prediction = prediction.replace(lane_logits=None)  # pyright: ignore[reportAttributeAccessIssue]
     each = jax.vmap(partial(element_terms, config=weights), in_axes=(0, 0, None, None))
     classes, boxes, apart = jax.vmap(each)(prediction, assignment, elements, size)  # each (B, D)
+    if weights.empty_frames == "skip":
+        classes = jnp.where(elements.valid.any(-1)[:, None], classes, 0.0)  # the other two are 0 there
     count = positives(assignment)
     return {
         "element_class": weights.class_weight * classes.sum(0) / count,

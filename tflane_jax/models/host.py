@@ -20,7 +20,7 @@ from tflane_jax.models.bev_encoder import BevMemory
 from tflane_jax.models.element_decoder import ElementDecoder, ElementDecoderConfig, ElementOutput
 from tflane_jax.models.encoders import EncoderConfig, encode_example, make_encoder, start_bev_memory
 from tflane_jax.models.evidence_encoder import EvidenceEncoderConfig
-from tflane_jax.models.parameters import with_xavier_layers
+from tflane_jax.models.parameters import with_torch_heads, with_xavier_layers
 from tflane_jax.models.prior import HostSpec, Prior
 from tflane_jax.models.priors import ByPrior, PriorsConfig, bev_hook, encode, observe, start_memories
 from tflane_jax.scene import Example, Prediction
@@ -48,8 +48,9 @@ class HostConfig:
         range: R_p, the box in which lanes are perceived, metres.
         priors: traffic flow, SD map, markers; none of them gives the vision-only baseline.
         elements: decoder of traffic elements, which needs cameras; None: no traffic elements.
-        initial: kernels of the decoders' transformer layers at the start of training: "lecun" (normal), or "xavier"
-            (uniform), as in the published code. Only `init` of the host itself applies it, see `Host.init`.
+        initial: the start of training. "lecun": kernels are normal, biases 0. "xavier", as in the published code:
+            kernels of the decoders' transformer layers are Xavier-uniform, heads have PyTorch's default and are equal
+            in all layers. Only `init` of the host itself applies it, see `Host.init`.
     """
 
     encoder: EncoderConfig = EvidenceEncoderConfig()
@@ -85,6 +86,11 @@ class HostConfig:
     def query_dim(self) -> int:
         """Channels of a query."""
         raise NotImplementedError
+
+    @property
+    def wanted_truth(self) -> tuple[str, ...]:
+        """Fields of `truth` that count for `LaneGraphTask.empty_frames`: a frame without any of them is empty."""
+        return self.truth
 
     @property
     def auxiliary(self) -> tuple[AuxiliaryName, ...]:
@@ -139,15 +145,16 @@ class Host(nn.Module):
 
     @nn.nowrap
     def init(self, rngs: Any, *args: Any, **kwargs: Any) -> Any:
-        """Return initial variables, as Linen does, with the kernels that `HostConfig.initial` names.
+        """Return initial variables, as Linen does, with the values that `HostConfig.initial` names.
 
-        Only `init` of the host itself does this. In another module, apply `with_xavier_layers` (and `with_equal_heads`)
-        to the host's part of the variables.
+        Only `init` of the host itself does this. In another module, apply `with_xavier_layers` and `with_torch_heads`
+        (and `with_equal_heads`) to the host's part of the variables.
         """
         variables = super().init(rngs, *args, **kwargs)
         if self.config.initial == "lecun":
             return variables
-        return with_xavier_layers(variables, rngs["params"] if isinstance(rngs, dict) else rngs)
+        key = rngs["params"] if isinstance(rngs, dict) else rngs
+        return with_torch_heads(with_xavier_layers(variables, key), key)
 
     def setup(self):
         config: HostConfig = self.config

@@ -78,6 +78,11 @@ class LaneSegNetConfig(HostConfig):
         return self.decoder.dim
 
     @property
+    def wanted_truth(self) -> tuple[str, ...]:
+        """Segments; crossings too where they are segments of the second class."""
+        return self.truth if self.areas is None else ("segments",)
+
+    @property
     def auxiliary(self) -> tuple[AuxiliaryName, ...]:
         """Those of the lane decoder, and those of every host."""
         return (*lane_auxiliary(self.decoder, self.denoising), *super().auxiliary)

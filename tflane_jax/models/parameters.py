@@ -8,9 +8,11 @@ import zlib
 from typing import Any
 
 import jax
+from flax.traverse_util import flatten_dict, unflatten_dict
 from jaxtyping import PRNGKeyArray
 
 from tflane_jax.layers.batch_norm import STATISTICS
+from tflane_jax.layers.initial import uniform_by_fan_in
 
 Params = dict[str, Any]
 """Variables of a model. The optional entry `STATISTICS` holds the running statistics of batch norms, which have no
@@ -87,6 +89,40 @@ def with_xavier_layers(variables: Any, key: PRNGKeyArray) -> Any:
         )
 
     return {**variables, "params": jax.tree_util.tree_map_with_path(drawn, variables["params"])}
+
+
+# Heads of TopoNet and BEVFormer-DETR, relationship heads of all hosts, and the heads of traffic elements, without what
+# starts at a constant: the focal class biases and the last layer of a box. Other heads draw PyTorch's values themselves
+# (`lane_segments.Branch`).
+_HEADS = re.compile(
+    r"""(
+        (?P<lane>heads_\d+)/(class_\d+/(kernel|bias) | class_out/kernel | points/linear_\d+/(kernel|bias))
+        | element_embedding_\d+/(expand|contract)/(kernel|bias)
+        | (heads_\d+/)?(successor|element_lane)/.+/(kernel|bias)
+        | elements/(class_\d+/kernel | box_\d+/hidden/linear_\d+/(kernel|bias))
+    )""",
+    re.VERBOSE,
+)
+_OF_LAYER = re.compile(r"^(heads|element_embedding|elements/class|elements/box)_\d+/")
+
+
+def with_torch_heads(variables: Any, key: PRNGKeyArray) -> Any:
+    """Return initial variables in which linear layers of the heads start as in PyTorch, equal in all decoder layers.
+
+    Kernels and biases are uniform within 1 / sqrt(inputs). The published code makes the heads of all layers, and the
+    embeddings of traffic elements, by copies of one.
+    """
+    params: dict[str, Any] = flatten_dict(variables["params"], sep="/")
+    for name, leaf in params.items():
+        found = _HEADS.fullmatch(name)
+        if found is None or (found["lane"] and f"{found['lane']}/class_out/kernel" not in params):
+            continue
+        module = name.rpartition("/")[0]
+        # The first layer for pairs reads both partners; its kernel is two parameters here.
+        inputs = params[f"{module}/kernel"].shape[0] * (2 if module.endswith(("pair_first", "pair_second")) else 1)
+        of_all_layers = jax.random.fold_in(key, zlib.crc32(_OF_LAYER.sub(r"\1/", name).encode()))
+        params[name] = uniform_by_fan_in(inputs)(of_all_layers, leaf.shape, leaf.dtype)
+    return {**variables, "params": unflatten_dict(params, sep="/")}
 
 
 def joined_statistics(variables: Any) -> Params:

@@ -1,4 +1,8 @@
-"""OpenLane-V2's submission: the file that its server and `tflane score` read, see `scoring.openlane_v2`."""
+"""OpenLane-V2's submission: the file that its server and `tflane score` read, see `scoring.openlane_v2`.
+
+As in the published code of TopoNet and LaneSegNet, every line is resampled at equal arc length in the ground plane,
+also one that has the official number of points already: the metrics compare points with the same index.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +10,7 @@ import pickle
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -41,21 +45,29 @@ class Author:
 
 
 def centerline_record(found: LaneDetections) -> dict[str, Any]:
-    """Return the predictions of a frame for the centerline task; lines get 11 points."""
+    """Return the predictions of a frame for the centerline task; lines are resampled to 11 points."""
     return _record(found, CENTERLINE, CENTERLINE_POINTS, [{} for _ in found.points])
 
 
-def segment_record(found: SegmentDetections) -> dict[str, Any]:
-    """Return the predictions of a frame for the lane-segment task; lines get 10 points, areas 20.
+def segment_record(found: SegmentDetections, crossings: Literal["ring", "sides"] = "ring") -> dict[str, Any]:
+    """Return the predictions of a frame for the lane-segment task; lines are resampled to 10 points, areas to 20.
 
-    Without predicted types, boundaries have the type 0, none.
+    Args:
+        found: detections. Without predicted types, boundaries have the type 0, none.
+        crossings: form of the areas: a "ring", resampled as one line, or two "sides", resampled each, as those of
+            crossings that are segments of the second class (`evaluation.lane_segments.segment_detections`).
     """
     sides = {"left": (found.left, found.left_type), "right": (found.right, found.right_type)}
     further: list[dict[str, Any]] = [{} for _ in found.lanes.points]
     for side, (lines, kinds) in sides.items():
         for i, line in enumerate(_with_points(lines, LINE_POINTS)):
             further[i] |= {f"{side}_laneline": line, f"{side}_laneline_type": 0 if kinds is None else int(kinds[i])}
-    areas = zip(_with_points(found.areas.points, AREA_POINTS), found.areas.categories, found.areas.scores, strict=True)
+    parts = 2 if crossings == "sides" else 1
+    outlines = [
+        np.concatenate(_with_points(np.split(np.asarray(area), parts), AREA_POINTS // parts))
+        for area in found.areas.points
+    ]
+    areas = zip(outlines, found.areas.categories, found.areas.scores, strict=True)
     return _record(found.lanes, SEGMENT, LINE_POINTS, further) | {
         "area": [
             {"id": i, "points": points, "category": int(category), "confidence": float(score)}
@@ -109,5 +121,5 @@ def _record(found: LaneDetections, names: FieldNames, count: int, further: Seque
 
 
 def _with_points(lines: Lines, count: int) -> list[Float[np.ndarray, "n 3"]]:
-    """Return lines with the official number of points."""
-    return [np.asarray(line if len(line) == count else resample(line, count), np.float32) for line in lines]
+    """Return lines with the official number of points, equally spaced."""
+    return [resample(np.asarray(line, float), count).astype(np.float32) for line in lines]

@@ -59,8 +59,8 @@ class LaneGraphTask(Task[Example, Example | Streamed, LaneGraphSource, HostMemor
         time: how training passes through the frames of a clip, if the host carries BEV features from frame to frame.
             "unrolled": the program holds every frame, and compiling takes as much longer; "scan": it holds one.
             Losses are equal up to rounding.
-        empty_frames: "skip" trains without frames that have none of the lanes or crossings of the host's ground truth,
-            as LaneSegNet does.
+        empty_frames: "skip" trains without frames that have none of the lanes or crossings of the host's ground truth
+            (`HostConfig.wanted_truth`), as TopoNet and LaneSegNet do.
     """
 
     model: HostConfig = TopoNetConfig()
@@ -206,7 +206,7 @@ class LaneGraphTask(Task[Example, Example | Streamed, LaneGraphSource, HostMemor
     def examples(self, data: Example | Streamed) -> Example | Streamed:
         """Return the examples themselves, or the clips that they form."""
         data = data if self.clip == 1 else as_clips(data, self.clip)
-        return data if self.empty_frames == "keep" else without_empty(data, self.model.truth)
+        return data if self.empty_frames == "keep" else without_empty(data, self.model.wanted_truth)
 
     def shapes(self, data: SplitData) -> Example:
         """Return shapes of the training parts of an example."""

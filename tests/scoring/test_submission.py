@@ -1,5 +1,7 @@
 """A submission holds what was detected, at the official numbers of points, and its own reader takes it."""
 
+import pickletools
+
 import numpy as np
 import pytest
 
@@ -121,6 +123,37 @@ def test_the_file_has_what_the_server_asks_for(tmp_path):
     assert [e["category"] for e in record["traffic_element"]] == [
         1 if e["attribute"] <= 3 else 2 for e in record["traffic_element"]
     ]
+
+
+def test_lanes_elements_and_areas_have_different_ids():
+    """The official check joins the ids of lanes and traffic elements and refuses repeated ones."""
+    record = centerline_record(detections(4, 11))
+    segments = SegmentDetections(
+        detections(4, 10),
+        *(np.zeros((4, 10, 3)),) * 2,
+        AreaDetections(np.zeros((3, 20, 3)), np.ones(3, int), np.ones(3)),
+    )
+    for record, lists in (
+        (record, ("lane_centerline", "traffic_element")),
+        (segment_record(segments), ("lane_segment", "traffic_element", "area")),
+    ):
+        ids = [thing["id"] for name in lists for thing in record[name]]
+        assert len(ids) == len(set(ids)) >= 7
+
+
+def test_what_the_author_leaves_out_is_not_in_the_file(tmp_path):
+    """The official check fails for an empty country, and only reports one that is absent."""
+    path = write_submission(tmp_path / "s.pkl", {KEY: centerline_record(detections(2, 11))}, Author("TF", team="T"))
+    content = load_plain_pickle(path)
+    assert {name: content[name] for name in content if name != "results"} == {"method": "TF", "team": "T"}
+
+
+def test_the_file_opens_with_the_numpy_of_the_official_program(tmp_path):
+    """Before numpy 2, the module of arrays had another name; the official program needs numpy below 1.24."""
+    path = write_submission(tmp_path / "s.pkl", {KEY: centerline_record(detections(2, 11))}, Author())
+    named = [argument for opcode, argument, _ in pickletools.genops(path.read_bytes()) if opcode.name == "GLOBAL"]
+    assert "numpy.core.multiarray _reconstruct" in named
+    assert not any("_core" in name for name in named)
 
 
 def test_boxes_go_back_to_pixels_of_the_file():

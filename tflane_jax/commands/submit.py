@@ -29,7 +29,7 @@ from tflane_jax.startup import showing, stage
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.training.runtime import configure_jax
 
-_OF_SERVER = ("method", "authors", "email", "institution", "country")
+_OF_SERVER = ("method", "authors", "email", "institution", "country", "team")
 
 
 def run(options: argparse.Namespace) -> int:
@@ -52,7 +52,9 @@ def run(options: argparse.Namespace) -> int:
             raise UserError("this model predicts neither centerlines nor lane segments: OpenLane-V2 has no other task")
         dataset = OpenLaneV2Dataset(source)
         found = {dataset.keys[i]: _record(dataset, answer) for i, answer in _answers(trained, source, len(dataset))}
-        author = Author(options.method, tuple(options.authors), options.email, options.institution, options.country)
+        author = Author(
+            options.method, tuple(options.authors), options.email, options.institution, options.country, options.team
+        )
         write_submission(options.out, found, author)
     elif isinstance(source, NuScenesConfig):
         if given := [name for name in _OF_SERVER if getattr(options, name)]:
@@ -86,15 +88,19 @@ def _answers(trained: Run, source: OpenLaneV2Config | NuScenesConfig, frames: in
                 bar.update(len(indices))
 
 
-def _map_frames(
-    dataset: NuScenesDataset, answers: Iterator[tuple[int, Prediction]]
-) -> Iterator[tuple[str, MapDetections]]:
-    """Yield sample tokens with the lines in MapTR's axes."""
+def _map_frames(dataset: NuScenesDataset, answers: Iterator[tuple[int, Prediction]]) -> list[tuple[str, MapDetections]]:
+    """Return sample tokens with the lines in MapTR's axes, in order of time.
+
+    MapTR's evaluation sorts frames by time and takes the predictions in their order, whatever the tokens say.
+    """
+    frames = []
     for index, answer in answers:
         assert answer.lines is not None
         found = detections_of_lines(answer.lines)
         points = dataset.in_lidar_axes(index, np.asarray(found.points, float))
-        yield dataset.token(index), MapDetections(points, found.classes, found.scores)
+        found = MapDetections(points.astype(np.float32), found.classes, found.scores)
+        frames.append((dataset.info(index).timestamp_ns, dataset.token(index), found))
+    return [(token, found) for _, token, found in sorted(frames, key=lambda frame: frame[0])]
 
 
 def _record(dataset: OpenLaneV2Dataset, answer: Prediction) -> dict[str, Any]:

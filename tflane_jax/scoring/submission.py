@@ -1,7 +1,9 @@
 """OpenLane-V2's submission: the file that its server and `tflane score` read, see `scoring.openlane_v2`.
 
 As in the published code of TopoNet and LaneSegNet, every line is resampled at equal arc length in the ground plane,
-also one that has the official number of points already: the metrics compare points with the same index.
+also one that has the official number of points already: the metrics compare points with the same index. Lanes, traffic
+elements and areas have different ids, as the official check demands, and the pickle opens under numpy 1.22, which the
+official program needs.
 """
 
 from __future__ import annotations
@@ -22,19 +24,24 @@ from tflane_jax.metrics.frames import ElementDetections, LaneDetections, Lines
 from tflane_jax.metrics.segment_matching import SegmentDetections
 from tflane_jax.scoring.openlane_v2 import AREA_POINTS, CENTERLINE_POINTS, LINE_POINTS
 
+# First id of each kind.
+_LANES, _ELEMENTS, _AREAS = 10_000, 20_000, 30_000
+# The module of numpy's arrays in a pickle of protocol 3, as numpy 2 and as numpy 1 call it.
+_NEW_NAME, _OLD_NAME = b"cnumpy._core.multiarray\n", b"cnumpy.core.multiarray\n"
 # Attributes up to this one are states of traffic lights (category 1), the others kinds of signs (category 2).
 _LAST_STATE = 3
 
 
 @dataclass(frozen=True)
 class Author:
-    """What the server asks of a submission; it may all be empty for a file of one's own.
+    """What the server asks of a submission; what is empty is left out of the file, which it may not take then.
 
     Attributes:
         method: its name.
         authors: their names.
         email, institution: of them.
         country: or region, as in ISO 3166.
+        team: its name, for lane segments.
     """
 
     method: str = ""
@@ -42,6 +49,7 @@ class Author:
     email: str = ""
     institution: str = ""
     country: str = ""
+    team: str = ""
 
 
 def centerline_record(found: LaneDetections) -> dict[str, Any]:
@@ -71,7 +79,7 @@ def segment_record(found: SegmentDetections, crossings: Literal["ring", "sides"]
     return _record(found.lanes, SEGMENT, LINE_POINTS, further) | {
         "area": [
             {"id": i, "points": points, "category": int(category), "confidence": float(score)}
-            for i, (points, category, score) in enumerate(areas)
+            for i, (points, category, score) in enumerate(areas, _AREAS)
         ]
     }
 
@@ -81,16 +89,19 @@ def write_submission(path: Path, records: Mapping[FrameKey, Mapping[str, Any]], 
 
     Raises UserError if the file cannot be written.
     """
-    content = {
+    about = {
         "method": author.method,
+        "team": author.team,
         "authors": list(author.authors),
         "e-mail": author.email,
         "institution / company": author.institution,
         "country / region": author.country,
-        "results": {tuple(key): {"predictions": record} for key, record in records.items()},
     }
-    with replacing(path) as temporary, temporary.open("wb") as file:
-        pickle.dump(content, file, protocol=4)
+    # The official check reports what is missing and goes on, but fails for a country that is empty.
+    content = {name: value for name, value in about.items() if value}
+    content["results"] = {tuple(key): {"predictions": record} for key, record in records.items()}
+    with replacing(path) as temporary:
+        temporary.write_bytes(pickle.dumps(content, protocol=3).replace(_NEW_NAME, _OLD_NAME))
     return path
 
 
@@ -101,7 +112,7 @@ def _record(found: LaneDetections, names: FieldNames, count: int, further: Seque
     return {
         names.lanes: [
             {"id": i, names.line: line, "confidence": float(score)} | more
-            for i, (line, score, more) in enumerate(lines)
+            for i, (line, score, more) in enumerate(lines, _LANES)
         ],
         "traffic_element": [
             {
@@ -112,7 +123,7 @@ def _record(found: LaneDetections, names: FieldNames, count: int, further: Seque
                 "confidence": float(score),
             }
             for i, (box, attribute, score) in enumerate(
-                zip(elements.boxes, elements.attributes, elements.scores, strict=True)
+                zip(elements.boxes, elements.attributes, elements.scores, strict=True), _ELEMENTS
             )
         ],
         names.lane_lane: np.asarray(found.successor, np.float32),

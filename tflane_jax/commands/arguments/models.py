@@ -136,6 +136,7 @@ def submit(commands) -> None:
     about.add_argument("--email", default="", help="address of the submitter")
     about.add_argument("--institution", default="", help="institution or company")
     about.add_argument("--country", default="", help="country or region, as in ISO 3166")
+    about.add_argument("--team", default="", help="name of the team; for lane segments")
 
 
 def convert(commands) -> None:

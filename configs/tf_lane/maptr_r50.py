@@ -15,7 +15,7 @@ kernel, `:remat` recomputes activations in the backward pass, `:bfloat16` does s
     tflane eval runs/maptr --data nuscenes --root PATH
 
 `:published_weights` reads nuScenes as the published code does, in the lidar's axes, with the vehicle's CAN bus, and
-trains as it does, with photometric distortion and GridMask.
+trains as it does, with photometric distortion and GridMask, but in float32.
 """
 
 from dataclasses import replace

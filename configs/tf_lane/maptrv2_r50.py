@@ -17,8 +17,9 @@ cameras and no depth. It reads the built-in world with that ring, not the data s
 
 `:published_weights` reads nuScenes as the published code does: in the lidar's axes, with the lift's border, and with
 cameras as calibrated, without the vehicle's motion between exposure and sweep. It trains as that code does, with
-photometric distortion and GridMask, and learns depth from the lidar's sweeps of the key frames (samples/LIDAR_TOP). For
-a copy of nuScenes without them: --data.depth-cell None --task.model.encoder.bev.no-supervised.
+photometric distortion and GridMask, but in float32, and learns depth from the lidar's sweeps of the key frames
+(samples/LIDAR_TOP). For a copy of nuScenes without them: --data.depth-cell None
+--task.model.encoder.bev.no-supervised.
 """
 
 from dataclasses import replace

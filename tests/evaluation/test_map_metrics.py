@@ -12,6 +12,7 @@ from tests.fakes import fake_example
 from tflane_jax.datasets.map_geometry import MapGeometry
 from tflane_jax.datasets.map_lines import MapLinesConfig, crop_map_lines
 from tflane_jax.datasets.procedural import STREET_EXAMPLE, ProceduralDataset, WorldData
+from tflane_jax.evaluation.found_lanes import lane_scores
 from tflane_jax.evaluation.lane_groups import LANE_GROUPS, line_groups
 from tflane_jax.evaluation.map_metrics import MapLineMetrics
 from tflane_jax.evaluation.vector_maps import detections_of_lines
@@ -129,6 +130,16 @@ def test_the_best_pairs_of_query_and_class_are_detections():
     assert np.asarray(found.points)[:, 0, 0].tolist() == [0.0, 0.0, 2.0]
     assert found.classes.tolist() == [0, 1, 1]
     np.testing.assert_allclose(found.scores, 1 / (1 + np.exp(-np.array([2.0, 1.0, 0.0]))))
+
+
+def test_at_most_fifty_pairs_are_detections():
+    """As in MapTRv2's variant with 70 lines and four classes; a host of 50 lines or fewer has one for each."""
+    logits = np.random.default_rng(0).normal(size=(70, 4))
+    found = LinePrediction(np.zeros((70, 4, 2)), logits)
+    best = np.sort(1 / (1 + np.exp(-logits.ravel())))[::-1][:50]
+    np.testing.assert_allclose(detections_of_lines(found).scores, best)
+    np.testing.assert_allclose(lane_scores(found), best)
+    assert len(detections_of_lines(LinePrediction(np.zeros((49, 4, 2)), logits[:49])).scores) == 49
 
 
 def straight(y, start=-15.0, stop=15.0):

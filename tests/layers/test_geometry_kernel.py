@@ -100,6 +100,18 @@ def test_it_is_the_sum_over_the_kernel_written_as_loops(params):
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-4)
 
 
+def test_attention_weights_start_xavier_uniform():
+    """MapTR's transformer overwrites the zeros that this module of its own starts with."""
+    query, features, reference, visible = scene()
+    module = GeometryKernelAttention(8, 2)
+    fresh = module.init(jax.random.key(1), query, features, [SHAPE], reference, jnp.asarray(visible))["params"]
+    kernel, limit = np.asarray(fresh["attention_weights"]["kernel"]), np.sqrt(6 / (8 + 30))
+    assert 0.9 * limit < np.abs(kernel).max() <= limit
+    assert abs(kernel.mean()) < 0.1 * limit
+    np.testing.assert_allclose(kernel.std(), limit / np.sqrt(3), rtol=0.1)
+    assert not np.asarray(fresh["attention_weights"]["bias"]).any()
+
+
 def test_enough_capacity_changes_nothing_and_too_little_is_reported(params):
     query, features, reference, visible = scene()
     counts, visible = visible.any(-1).sum(1), jnp.asarray(visible)

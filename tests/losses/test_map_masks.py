@@ -36,11 +36,11 @@ def cells(mask):
     return sorted(map(tuple, np.argwhere(np.asarray(mask)).tolist()))
 
 
-def test_a_straight_line_covers_three_rows():
+def test_a_straight_line_covers_five_rows():
     mask = bev_line_mask(lines([(-29.9, 0.1), (0, 0.1), (29.9, 0.1)]), SHAPE, RANGE)
-    assert cells(mask) == [(row, column) for row in (24, 25, 26) for column in range(100)]
+    assert cells(mask) == [(row, column) for row in range(23, 28) for column in range(100)]
     across = bev_line_mask(lines([(0.1, -14.9), (0.1, 0), (0.1, 14.9)]), SHAPE, RANGE)
-    assert cells(across) == [(row, column) for row in range(50) for column in (49, 50, 51)]
+    assert cells(across) == [(row, column) for row in range(50) for column in range(48, 53)]
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -51,15 +51,12 @@ def test_masks_agree_with_opencv(seed):
     curves = np.cumsum(rng.uniform(-3, 3, (4, 12, 2)), 1) + rng.uniform(-10, 10, (4, 1, 2))
     corners = np.floor(RANGE.normalise(curves) * size)
     mask = np.asarray(bev_line_mask(lines(*RANGE.denormalise((corners + 0.5) / size)), SHAPE, RANGE))
-    thin, thick = np.zeros(SHAPE, np.uint8), np.zeros(SHAPE, np.uint8)
+    thick = np.zeros(SHAPE, np.uint8)
     for curve in corners.astype(np.int32):
-        cv2.polylines(thin, [curve], False, 1, 1)
         cv2.polylines(thick, [curve], False, 1, 3)
-    dilated = maximum_filter(thin, 3) > 0
-    assert (mask & dilated).sum() / (mask | dilated).sum() > 0.93
-    # OpenCV's own lines of three cells are up to a cell thicker where they are oblique.
-    assert (thick[mask] > 0).mean() > 0.97
-    assert maximum_filter(mask, 3)[thick > 0].all()
+    thick = thick > 0
+    assert (mask & thick).sum() / (mask | thick).sum() > 0.92
+    assert maximum_filter(mask, 3)[thick].all()
 
 
 def test_lines_are_cut_at_the_border_or_run_along_it_and_padding_draws_nothing():
@@ -67,16 +64,28 @@ def test_lines_are_cut_at_the_border_or_run_along_it_and_padding_draws_nothing()
     inside = lines([(-29.9, 0.1), (0, 0.1), (29.9, 0.1)])
     np.testing.assert_array_equal(bev_line_mask(outside, SHAPE, RANGE), bev_line_mask(inside, SHAPE, RANGE))
     assert not bev_line_mask(lines(), SHAPE, RANGE).any()
-    for row, edge in ((slice(0, 2), -15), (slice(48, 50), 15)):
+    for row, edge in ((slice(0, 3), -15), (slice(47, 50), 15)):
         mask = np.asarray(bev_line_mask(lines([(-30, edge), (0, edge), (30, edge)]), SHAPE, RANGE))
         assert mask[row].all()
-        assert mask.sum() == 200
-    for column, edge in ((slice(0, 2), -30), (slice(98, 100), 30)):
+        assert mask.sum() == 300
+    for column, edge in ((slice(0, 3), -30), (slice(97, 100), 30)):
         mask = np.asarray(bev_line_mask(lines([(edge, -15), (edge, 0), (edge, 15)]), SHAPE, RANGE))
         assert mask[:, column].all()
-        assert mask.sum() == 100
-    still = lines([(3, 3), (3, 3), (3, 3)])
-    assert bev_line_mask(still, SHAPE, RANGE).sum() == 9
+        assert mask.sum() == 150
+    still = np.asarray(bev_line_mask(lines([(3.1, 3.1), (3.1, 3.1), (3.1, 3.1)]), SHAPE, RANGE))
+    disc = np.add.outer(np.arange(-2, 3) ** 2, np.arange(-2, 3) ** 2) <= 4
+    np.testing.assert_array_equal(still[28:33, 53:58], disc)
+    assert still.sum() == 13
+
+
+def test_lines_are_drawn_at_their_dense_points_where_labels_have_them():
+    """The points that a model learns cut the corner of a right angle."""
+    corner = [(3, -6), (3, 6), (15, 6)]
+    ends, true = lines([corner[0], corner[2]]), lines(corner)
+    both, views = dataclasses.replace(ends, dense=true.points), fake_views()
+    for draw in (lambda of: bev_line_mask(of, SHAPE, RANGE), lambda of: view_line_masks(of, views, (12, 16))):
+        np.testing.assert_array_equal(draw(both), draw(true))
+        assert (np.asarray(draw(both)) != draw(ends)).any()
 
 
 def test_images_show_the_cells_that_projected_lines_cross():

@@ -12,7 +12,8 @@ from tests.models.cases import CAMERA, LINES, SMALL_LINES, make_camera_example, 
 from tests.parameters import random_params
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import BevGrid, PerceptionRange, invert_pose, project, transform_points, yaw_pose
-from tflane_jax.losses.map_masks import bev_line_mask
+from tflane_jax.losses.map_masks import bev_line_mask, view_line_masks
+from tflane_jax.losses.maptrv2 import MapTrV2LossConfig
 from tflane_jax.models.bevformer import can_bus_vector
 from tflane_jax.models.lane_denoising import DenoisingConfig
 from tflane_jax.models.lidar_axes import (
@@ -137,6 +138,62 @@ def test_the_truth_of_the_bev_mask_lies_where_the_mask_does(vehicle):
     assert np.asarray(found != expected).mean() < 0.002  # cells whose edge a line touches
     assert 0.02 < np.asarray(found).mean() < 0.3
     assert np.asarray(found != bev_line_mask(lines, (ego.rows, ego.columns), RANGE)).mean() > (0.02 if vehicle else -1)
+
+
+def some_lines():
+    """Return three lines and padding; the dense points lie elsewhere, so that it shows which are meant."""
+    lines, rng = MapLines.empty(4, 4, 6), np.random.default_rng(3)
+    for points in (lines.points, lines.dense):
+        points[:3], points[3] = rng.uniform([-20, -10, -1], [20, 10, 1], (3, points.shape[1], 3)), np.nan
+    lines.valid[:3] = True
+    return jax.tree.map(jnp.asarray, lines)
+
+
+def test_the_dense_points_move_with_the_lines():
+    lines, example, host = some_lines(), make_example(), with_cameras(range_in_lidar_axes(RANGE), axes="lidar")
+    for move in (host.lines_over_bev, host.lines_in_views):
+        expected = move(lines.replace(points=lines.dense, dense=None), example).points
+        moved = move(lines, example)
+        np.testing.assert_array_equal(moved.dense, expected)
+        assert moved.points.shape == lines.points.shape
+        assert np.isfinite(moved.dense[:3]).all()
+
+
+def test_the_truth_of_the_image_masks_lies_in_the_lidars_plane():
+    """MapTRv2 projects (x, y) of the level frame and -1.6 m by the cameras' poses in the tilted lidar."""
+    lines, example, lidar = some_lines(), make_example(), range_in_lidar_axes(RANGE)
+    host = with_cameras(lidar, MapTrV2Config, range=RANGE, axes="lidar")
+    level = yaw_pose(0.9, 0.1, -np.pi / 2)
+    flat = transform_points(np.linalg.inv(level), np.asarray(lines.dense)[:3].reshape(-1, 3))
+    published = np.column_stack([flat[:, :2], np.full(len(flat), -1.6)])
+    turned, found = in_lidar_axes(example).cameras, host.lines_in_views(lines, example)
+    for v in (0, 1):
+        calibration = example.cameras.intrinsics[v]
+        expected, depth, _ = project(published, calibration, np.asarray(turned.camera_from_ego[v]))
+        ours = project(np.asarray(found.dense)[:3].reshape(-1, 3), calibration, example.cameras.camera_from_ego[v])
+        np.testing.assert_allclose(ours[1], depth, atol=1e-4)
+        assert (depth > 0.5).any()
+        np.testing.assert_allclose(ours[0][depth > 0.5], expected[depth > 0.5], rtol=1e-3, atol=1e-2)
+    # In the ego axes, and where no lidar is known, lines lie where the map has them.
+    unknown = make_example(vehicle=False)
+    for kept in (with_cameras(RANGE).lines_in_views(lines, example), host.lines_in_views(lines, unknown)):
+        jax.tree.map(np.testing.assert_array_equal, kept, lines)
+
+
+def test_the_loss_draws_image_masks_in_the_lidars_plane():
+    """A head that knows the masks in that plane has less loss than one that knows those on level ground."""
+    lines, example = some_lines(), make_example()
+    host = with_cameras(range_in_lidar_axes(RANGE), MapTrV2Config, range=RANGE, axes="lidar")
+    batch = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], example.replace(map_lines=lines))
+    views = jax.tree.map(lambda leaf: leaf[0], batch.cameras)
+
+    def loss(known):
+        mask = view_line_masks(known, views, (12, 16))
+        logits = jnp.where(mask, 30.0, -30.0)[None]
+        terms = MapTrV2LossConfig().auxiliary_terms("view_line_masks", logits, None, batch, host)
+        return float(terms["view_mask"].sum())
+
+    assert loss(host.lines_in_views(lines, example)) < 1e-6 < 0.1 < loss(lines)
 
 
 def with_cameras(range_, kind=MapTrConfig, **settings):

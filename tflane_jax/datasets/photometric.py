@@ -60,7 +60,10 @@ TOPONET_PHOTOMETRIC = LANESEGNET_PHOTOMETRIC
 LANESEGNET_BUCKET_PHOTOMETRIC = PhotometricConfig(probability=0.0, swap=0.0, grid_mask=0.7)
 """LaneSegNet's map-element-bucket variant: the GridMask alone."""
 MAPTR_PHOTOMETRIC = LANESEGNET_PHOTOMETRIC
-"""MapTR and MapTRv2 at the papers' size have the same."""
+"""MapTR and MapTRv2 at the papers' size have the same.
+
+The published MapTR distorts colours at 1600 x 900 pixels before it halves images, MapTRv2 after; here both do so after.
+"""
 
 
 def augment_example(example: Example, config: PhotometricConfig, seed: int | Sequence[int]) -> Example:

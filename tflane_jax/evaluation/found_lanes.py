@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.special import expit
 
-from tflane_jax.evaluation.vector_maps import detections_of_lines, measured_lines, truth_of_lines
+from tflane_jax.evaluation.vector_maps import detections_of_lines, kept_pairs, measured_lines, truth_of_lines
 from tflane_jax.metrics.centerline_matching import nearest_lanes
 from tflane_jax.metrics.map_matching import MAP_THRESHOLDS, match_map
 from tflane_jax.metrics.segment_matching import nearest_segments
@@ -62,7 +62,7 @@ def lane_scores(found: CenterlinePrediction | SegmentPrediction | LinePrediction
     """Return the confidences of detected lanes, 0 for crossings; of lines those of the best pairs of query, class."""
     if isinstance(found, LinePrediction):
         every = expit(np.asarray(found.logits, np.float64))
-        return -np.sort(-every.reshape(*every.shape[:-2], -1))[..., : every.shape[-2]]
+        return -np.sort(-every.reshape(*every.shape[:-2], -1))[..., : kept_pairs(every.shape[-2])]
     scores = np.asarray(found.scores)
     if isinstance(found, SegmentPrediction):
         return np.where(np.asarray(found.logits).argmax(-1) == 0, scores, 0.0)

@@ -13,6 +13,8 @@ from tflane_jax.scene import Areas, AreaType, LaneGraph, LinePrediction, LineTyp
 _DIVIDER, _CROSSING, _BOUNDARY = (CLASSES.index(name) for name in ("divider", "ped_crossing", "boundary"))
 # Neighbouring segments both contain the line between them: lines closer than this along all points are one, metres.
 _SAME_LINE = 0.2
+# Published `max_num`, also of the variant with centerlines and its 70 queries.
+_MOST_LINES = 50
 
 
 def truth_of_segment_lines(segments: LaneGraph, areas: Areas) -> MapTruth:
@@ -97,13 +99,18 @@ def measured_lines(lines: MapLines, found: LinePrediction) -> Bool[np.ndarray, "
     return np.asarray(lines.valid) & (np.asarray(lines.category) < found.logits.shape[-1])
 
 
-def detections_of_lines(lines: LinePrediction) -> MapDetections:
-    """Return the last decoder layer's lines of one example: as in MapTR, the Q best of its Q x C pairs of query, class.
+def kept_pairs(queries: int) -> int:
+    """Return how many of the best pairs of query and class are detections: one for each query, at most 50."""
+    return min(queries, _MOST_LINES)
 
-    A query may therefore be two lines of different classes.
+
+def detections_of_lines(lines: LinePrediction) -> MapDetections:
+    """Return the last decoder layer's lines of one example: as in MapTR, the best of its Q x C pairs of query, class.
+
+    These are `kept_pairs(Q)`. A query may therefore be two lines of different classes.
     """
     confidence = expit(np.asarray(lines.logits, np.float64))
     queries, classes = confidence.shape
-    best = np.argsort(-confidence, axis=None, kind="stable")[:queries]
+    best = np.argsort(-confidence, axis=None, kind="stable")[: kept_pairs(queries)]
     points, dims = np.asarray(lines.points)[best // classes], 3 if lines.points.shape[-1] == 3 else 2
     return map_detections(points, best % classes, confidence.ravel()[best], dims=dims)

@@ -64,9 +64,9 @@ class GeometryKernelAttention(nn.Module):
         value = nn.Dense(self.dim, kernel_init=_INIT, dtype=self.dtype, name="value_proj")(features)
         value = value.reshape(cameras, -1, heads, self.dim // heads).astype(jnp.float32)
         rows, columns = self.kernel
-        logits = nn.Dense(
-            heads * rows * columns, kernel_init=nn.initializers.zeros, dtype=self.dtype, name="attention_weights"
-        )(query)
+        # The module's own zeros do not last: MapTR's transformer initialises all matrices but those of three deformable
+        # attentions.
+        logits = nn.Dense(heads * rows * columns, kernel_init=_INIT, dtype=self.dtype, name="attention_weights")(query)
         weights = jax.nn.softmax(logits.reshape(queries, heads, rows * columns).astype(jnp.float32), -1)
         seen = visible.any(-1)
         if self.capacity is None or self.capacity >= queries:

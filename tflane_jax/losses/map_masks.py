@@ -1,13 +1,15 @@
 """Targets of MapTRv2's auxiliary heads: map lines as masks in BEV and in the images, and depth bins.
 
-MapTRv2 draws its masks with OpenCV: in BEV with lines of three cells, in the images with lines of one cell of the
-feature map. Here a cell belongs to a line that passes through it, and BEV masks are dilated by one cell (OpenCV's
-oblique lines of three cells are up to a cell thicker). A line that leaves the image or passes behind the camera is cut
-there (the published code joins what remains by a straight line).
+MapTRv2 draws its masks with OpenCV: in BEV with OpenCV's thickness 3, which covers five cells, in the images with lines
+of one cell of the feature map. Here a cell belongs to a line that passes through it, and BEV masks are dilated by the
+disc of five cells that OpenCV draws around a point. Lines are taken at their dense points where the labels have them,
+100 on each (the published code draws the original vertices in BEV, 200 points in the images). A line that leaves the
+image or passes behind the camera is cut there (the published code joins what remains by a straight line).
 """
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import jax
@@ -22,10 +24,12 @@ from tflane_jax.scene import CameraViews, MapLines
 
 # Lines are cut at this depth, metres.
 _NEAR = 0.1
+# Windows (rows, columns) whose union is the disc of radius 2.
+_DISC = (3, 3), (5, 1), (1, 5)
 
 
 def bev_line_mask(lines: MapLines, shape: tuple[int, int], range_: PerceptionRange) -> Bool[Array, "h w"]:
-    """Return the BEV cells within one cell of any line, of all classes, of one example.
+    """Return the BEV cells within two cells of any line, of all classes, of one example.
 
     Args:
         lines: padding may hold anything.
@@ -34,10 +38,11 @@ def bev_line_mask(lines: MapLines, shape: tuple[int, int], range_: PerceptionRan
     """
     h, w = shape
     size = jnp.asarray((w, h), jnp.float32)[None, None]
-    points = jnp.where(lines.valid[:, None, None], lines.points[..., :2], 0.0)
-    points = range_.normalise(points) * size
-    drawn = _drawn(points[:, :-1].reshape(-1, 2), points[:, 1:].reshape(-1, 2), _pieces(lines), shape)
-    return lax.reduce_window(drawn, False, lax.bitwise_or, (3, 3), (1, 1), "SAME")
+    points, pieces = _points(lines)
+    points = range_.normalise(points[..., :2]) * size
+    drawn = _drawn(points[:, :-1].reshape(-1, 2), points[:, 1:].reshape(-1, 2), pieces, shape)
+    windows = (lax.reduce_window(drawn, False, lax.bitwise_or, window, (1, 1), "SAME") for window in _DISC)
+    return functools.reduce(jnp.logical_or, windows)
 
 
 def view_line_masks(lines: MapLines, views: CameraViews, shape: tuple[int, int]) -> Bool[Array, "v h w"]:
@@ -49,14 +54,14 @@ def view_line_masks(lines: MapLines, views: CameraViews, shape: tuple[int, int])
         shape: (h, w) of the feature map, which covers the whole image array.
     """
     (h, w), (height, width) = shape, views.image.shape[1:3]
-    points = jnp.where(lines.valid[:, None, None], lines.points, 0.0)
+    points, pieces = _points(lines)
     cells: Any = jnp.diag(jnp.asarray((w / width, h / height, 1.0)))
 
     def one(intrinsics, camera_from_ego):
         local = product(transform_points(camera_from_ego, points.reshape(-1, 3)), product(cells, intrinsics).T)
         local = local.reshape(points.shape)
         start, end = local[:, :-1].reshape(-1, 3), local[:, 1:].reshape(-1, 3)
-        ahead = _pieces(lines) & (jnp.maximum(start[:, 2], end[:, 2]) > _NEAR)
+        ahead = pieces & (jnp.maximum(start[:, 2], end[:, 2]) > _NEAR)
         start, end = _from_near(start, end), _from_near(end, start)
         start, end = (side[:, :2] / side[:, 2:] for side in (start, end))
         return _drawn(start, end, ahead, shape)
@@ -97,9 +102,11 @@ def depth_targets(
     return jnp.where(valid, jnp.floor((nearest - low) / step), 0.0).astype(jnp.int32), valid
 
 
-def _pieces(lines: MapLines) -> Bool[Array, " k"]:
-    """Return which straight pieces of all lines are valid."""
-    return jnp.repeat(jnp.asarray(lines.valid), lines.points.shape[1] - 1)
+def _points(lines: MapLines) -> tuple[Float[Array, "l s 3"], Bool[Array, " k"]]:
+    """Return the points to draw, zeros in padding, and which straight pieces of all lines are valid."""
+    points = lines.points if lines.dense is None else lines.dense
+    valid = jnp.asarray(lines.valid)
+    return jnp.where(valid[:, None, None], points, 0.0), jnp.repeat(valid, points.shape[1] - 1)
 
 
 def _from_near(start: Float[Array, "k 3"], end: Float[Array, "k 3"]) -> Float[Array, "k 3"]:
@@ -131,9 +138,10 @@ def _drawn(
     valid = valid & (enter <= leave)
     first = start + enter[:, None] * step
     inside = (leave - enter)[:, None] * step
-    count = jnp.ceil(jnp.abs(inside).max(1))
-    number = jnp.arange(max(h, w) + 1, dtype=jnp.float32)[None]
-    along = number / jnp.maximum(count, 1.0)[:, None]
+    # Steps of whole cells could pass over one by rounding: these are shorter.
+    count = jnp.ceil(jnp.abs(inside).max(1)) + 1.0
+    number = jnp.arange(max(h, w) + 2, dtype=jnp.float32)[None]
+    along = number / count[:, None]
     cells = jnp.floor(first[:, None] + along[..., None] * inside[:, None]).astype(jnp.int32)
     kept = valid[:, None] & (number <= count[:, None])
     # The border itself belongs to the last cell.

@@ -54,7 +54,8 @@ class MapTrV2LossConfig(MapTrLossConfig):
             masks = jax.vmap(partial(bev_line_mask, shape=output.shape[-2:], range_=range_))(over)
             return {"mask": self.mask_weight * mask_loss(output, masks, self.mask_positive)[None]}
         if name == "view_line_masks":
-            masks = jax.vmap(partial(view_line_masks, shape=output.shape[-2:]))(lines, views)
+            seen = jax.vmap(host.lines_in_views)(lines, batch)
+            masks = jax.vmap(partial(view_line_masks, shape=output.shape[-2:]))(seen, views)
             there = views.valid[..., None, None]
             return {"view_mask": self.view_mask_weight * mask_loss(output, masks, self.view_mask_positive, there)[None]}
         if name == "depth":

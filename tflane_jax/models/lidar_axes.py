@@ -2,13 +2,16 @@
 
 Such a host turns its inputs into the lidar's frame and its lines back into the frame of the example, so that data,
 losses, metrics and pictures stay in one frame. Cameras take the lidar's whole pose, with height and tilt, as the
-published code does. All else takes the level pose: the lidar's place and heading above the ground.
+published code does, and so do the lines of masks in the images. All else takes the level pose: the lidar's place and
+heading above the ground.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import flax.linen as nn
@@ -19,6 +22,9 @@ from tflane_jax.geometry import PerceptionRange, invert_pose, pose_yaw, transfor
 from tflane_jax.geometry.namespace import product
 from tflane_jax.models.prior import BevCells, HostQueries, Prior
 from tflane_jax.scene import CameraViews, Example, MapLines, SdMap, TrafficFlow, VehicleState
+
+# Height of the lines of MapTRv2's masks in the images, in the lidar's axes, metres.
+_PLANE = -1.6
 
 
 def range_in_lidar_axes(range_: PerceptionRange) -> PerceptionRange:
@@ -72,8 +78,33 @@ def lines_beside_lidar(lines: MapLines, example: Example) -> MapLines:
         example: knows the lidar's pose.
     """
     turn = yaw_pose(*jnp.array([0.0, 0.0, -math.pi / 2]))
-    pose = product(turn, invert_pose(level_pose(example)))
-    return replace(lines, points=lines_in_ego_axes(jnp.asarray(lines.points), pose))
+    return _moved(lines, partial(lines_in_ego_axes, level=product(turn, invert_pose(level_pose(example)))))
+
+
+def lines_below_lidar(lines: MapLines, example: Example) -> MapLines:
+    """Return map lines in the plane that MapTRv2's masks in the images have: 1.6 m below the lidar, tilted as it is.
+
+    The published code takes (x, y) of the level frame for those of the lidar's axes.
+
+    Args:
+        lines: of the example's frame; padding may hold anything.
+        example: knows the lidar's pose; without one, the lines stay as they are.
+    """
+    if example.cameras is None or example.cameras.vehicle is None:
+        return lines
+    into, back = invert_pose(level_pose(example)), invert_pose(lidar_from_ego(example))
+
+    def dropped(points: Float[Array, "l p 3"]) -> Float[Array, "l p 3"]:
+        plane = lines_in_ego_axes(points, into).at[..., 2].set(_PLANE)
+        return lines_in_ego_axes(plane, back)
+
+    return _moved(lines, dropped)
+
+
+def _moved(lines: MapLines, move: Callable[[Float[Array, "l p 3"]], Float[Array, "l p 3"]]) -> MapLines:
+    """Return map lines with both of their forms moved."""
+    dense = None if lines.dense is None else move(jnp.asarray(lines.dense))
+    return replace(lines, points=move(jnp.asarray(lines.points)), dense=dense)
 
 
 def lines_in_ego_axes(points: Float[Array, "*b p d"], level: Float[Array, "4 4"]) -> Float[Array, "*b p d"]:

@@ -32,6 +32,7 @@ from tflane_jax.models.lidar_axes import (
     InLidarAxes,
     in_lidar_axes,
     level_pose,
+    lines_below_lidar,
     lines_beside_lidar,
     lines_in_ego_axes,
     range_in_ego_axes,
@@ -116,6 +117,10 @@ class MapTrConfig(HostConfig):
     def lines_over_bev(self, lines: MapLines, example: Example) -> MapLines:
         """Return map lines of the example's frame in that of the raster of line masks, whose range is `bev_range`."""
         return lines if self.axes == "ego" else lines_beside_lidar(lines, example)
+
+    def lines_in_views(self, lines: MapLines, example: Example) -> MapLines:
+        """Return map lines of the example's frame as the masks in the images show them, in the same frame."""
+        return lines if self.axes == "ego" else lines_below_lidar(lines, example)
 
     def build_priors(self) -> dict[str, Prior]:
         """Return the priors of this host, by name; they observe examples in the host's own axes."""

@@ -112,7 +112,7 @@ def test_what_only_one_server_takes_is_refused_elsewhere(monkeypatch, tmp_path):
     config = RunConfig(data=NuScenesData(tmp_path / "nowhere"))
     monkeypatch.setattr(submit, "opened", lambda options: (SimpleNamespace(config=config), []))
     given = {"data": None, "root": None, "split": None, "default_split": "test", "openlane": None}
-    told = {"method": "", "authors": [], "email": "", "institution": "", "country": "CH"}
+    told = {"method": "", "authors": [], "email": "", "institution": "", "country": "CH", "team": ""}
     with pytest.raises(UserError, match="--country is for OpenLane-V2's server"):
         submit.run(argparse.Namespace(out=tmp_path / "out.json", **given, **told))
 

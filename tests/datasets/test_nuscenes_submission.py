@@ -1,6 +1,7 @@
 """MapTR's file of results for nuScenes: points around the lidar, tokens of samples, what the model predicts."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 from tests.datasets.nuscenes_small import write_nuscenes
 from tests.models.cases import SMALL_LINES
 from tflane_jax.cli import main
+from tflane_jax.commands import submit
 from tflane_jax.config import RunConfig
 from tflane_jax.datasets.base import ExampleConfig
 from tflane_jax.datasets.map_lines import MapLinesConfig
@@ -16,6 +18,7 @@ from tflane_jax.datasets.nuscenes import NuScenesConfig, NuScenesData, NuScenesD
 from tflane_jax.evaluation.predict import predictions
 from tflane_jax.evaluation.vector_maps import detections_of_lines
 from tflane_jax.losses.maptr import MapTrLossConfig
+from tflane_jax.metrics.map_matching import MapDetections
 from tflane_jax.models.priors import PriorsConfig
 from tflane_jax.runs import open_run, train_run
 from tflane_jax.scoring.maptr import read_predictions
@@ -42,6 +45,22 @@ def test_points_of_examples_in_maptrs_axes(root, frame):
     np.testing.assert_allclose(dataset.in_lidar_axes(0, np.array([[ahead, 3.0]])), [[-3.0, 9.06]], atol=1e-9)
     assert dataset.in_lidar_axes(0, np.zeros((0, 20, 2))).shape == (0, 20, 2)
     assert dataset.token(1) == dataset.frames("scene-0061").samples[1]["token"]
+
+
+def test_frames_are_written_in_order_of_time(monkeypatch):
+    """MapTR's evaluation pairs the n-th result with the n-th frame by time; scenes are not sorted by it."""
+    times = [30, 40, 10, 20]
+    points = np.arange(4.0)[:, None, None, None] * np.ones((1, 5, 2))
+    dataset = SimpleNamespace(
+        info=lambda index: SimpleNamespace(timestamp_ns=times[index]),
+        token=lambda index: f"token {times[index]}",
+        in_lidar_axes=lambda index, points: points,
+    )
+    monkeypatch.setattr(submit, "detections_of_lines", lambda lines: MapDetections(lines, np.zeros(1, int), np.ones(1)))
+    answers = ((index, SimpleNamespace(lines=points[index])) for index in range(4))
+    frames = submit._map_frames(dataset, answers)
+    assert [token for token, _ in frames] == ["token 10", "token 20", "token 30", "token 40"]
+    assert [found.points[0, 0, 0] for _, found in frames] == [2.0, 3.0, 0.0, 1.0]
 
 
 @pytest.mark.slow

@@ -127,14 +127,14 @@ def test_the_file_has_what_the_server_asks_for(tmp_path):
 
 def test_lanes_elements_and_areas_have_different_ids():
     """The official check joins the ids of lanes and traffic elements and refuses repeated ones."""
-    record = centerline_record(detections(4, 11))
+    centerlines = centerline_record(detections(4, 11))
     segments = SegmentDetections(
         detections(4, 10),
         *(np.zeros((4, 10, 3)),) * 2,
         AreaDetections(np.zeros((3, 20, 3)), np.ones(3, int), np.ones(3)),
     )
     for record, lists in (
-        (record, ("lane_centerline", "traffic_element")),
+        (centerlines, ("lane_centerline", "traffic_element")),
         (segment_record(segments), ("lane_segment", "traffic_element", "area")),
     ):
         ids = [thing["id"] for name in lists for thing in record[name]]

@@ -75,6 +75,7 @@ CATEGORIES: Mapping[str, RoadUser | None] = {
     "CONSTRUCTION_CONE": None,
     "CONSTRUCTION_BARREL": None,
     "MOBILE_PEDESTRIAN_CROSSING_SIGN": None,
+    "MOBILE_PEDESTRIAN_SIGN": None,  # the same in the data set's README
     "MESSAGE_BOARD_TRAILER": None,
     "TRAFFIC_LIGHT_TRAILER": None,
     "EGO_VEHICLE": None,

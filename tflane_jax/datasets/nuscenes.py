@@ -47,6 +47,7 @@ from tflane_jax.datasets.openlane_frames import FrameCamera
 from tflane_jax.datasets.overlap import frame_drives
 from tflane_jax.datasets.photometric import PhotometricConfig
 from tflane_jax.datasets.prepared_map import prepare_map
+from tflane_jax.datasets.recent import Recent
 from tflane_jax.datasets.streaming import StreamingConfig
 from tflane_jax.datasets.view_images import TOPONET_SUBSET_B, ImageConfig, ImageFit
 from tflane_jax.errors import UserError
@@ -57,6 +58,8 @@ from tflane_jax.scene.logs import Log
 
 # Metres of map beyond the corners of the perception range, so that chains of lanes are merged as on the whole map.
 _BEYOND = 60.0
+# Logs that are kept, some 2.4 MB each; the whole data set has 850.
+_LOGS = 256
 
 
 @dataclass(frozen=True)
@@ -100,8 +103,8 @@ class NuScenesConfig:
 class NuScenesDataset:
     """Key frames of one split, sorted by scene, then time.
 
-    Logs and maps are made when they are first asked for, and kept. Raises UserError for tables that are missing or
-    damaged and for a split without scenes.
+    Logs and maps are made when they are first asked for; maps and the logs last asked for are kept. Raises UserError
+    for tables that are missing or damaged and for a split without scenes.
     """
 
     def __init__(self, config: NuScenesConfig):
@@ -115,12 +118,13 @@ class NuScenesDataset:
         self.scenes = {name: scenes[name] for name in names}
         self._places = [(name, i) for name in names for i in range(len(self.tables.samples(scenes[name])))]
         self._frames: dict[str, SceneFrames] = {}
-        self._logs: dict[str, Log] = {}
         self._maps: dict[str, MapExpansion] = {}
         self._lock = threading.Lock()
+        self.log = Recent(self._log, _LOGS)
+        """Scene name -> the scene as a log with the part of the city's map around it."""
 
     def __getstate__(self):
-        return self.__dict__ | {"_lock": None}
+        return self.__dict__ | {"_lock": None, "_frames": {}, "_maps": {}}
 
     def __setstate__(self, state):
         self.__dict__.update(state | {"_lock": threading.Lock()})
@@ -186,29 +190,22 @@ class NuScenesDataset:
         x, y = np.moveaxis(transform_points(plane, points[..., :2]), -1, 0)
         return np.concatenate([np.stack([-y, x], -1), points[..., 2:]], -1)
 
-    def log(self, name: str) -> Log:
-        """Return a scene as a log with the part of the city's map around it."""
-        with self._lock:
-            if name not in self._logs:
-                frames = self._scene_frames(name)
-                location, scene = self.tables.location(self.scenes[name]), self.scenes[name]
-                if location not in self._maps:
-                    self._maps[location] = read_expansion(self.tables.map_path(location))
-                area = self._maps[location].around(frames.global_from_frame[:, :2, 3], _reach(self.config.example))
-                log = scene_log(self.tables, scene, frames, area, least_visibility=self.config.least_visibility)
-                prepare_map(log.map, bike_lanes=self.config.example.bike_lanes == "include")
-                self._logs[name] = log
-            return self._logs[name]
+    def _log(self, name: str) -> Log:
+        frames = self.frames(name)
+        location, scene = self.tables.location(self.scenes[name]), self.scenes[name]
+        if location not in self._maps:  # `Recent` makes one log at a time
+            self._maps[location] = read_expansion(self.tables.map_path(location))
+        area = self._maps[location].around(frames.global_from_frame[:, :2, 3], _reach(self.config.example))
+        log = scene_log(self.tables, scene, frames, area, least_visibility=self.config.least_visibility)
+        prepare_map(log.map, bike_lanes=self.config.example.bike_lanes == "include")
+        return log
 
     def frames(self, name: str) -> SceneFrames:
         """Return moments and poses of a scene."""
         with self._lock:
-            return self._scene_frames(name)
-
-    def _scene_frames(self, name: str) -> SceneFrames:
-        if name not in self._frames:
-            self._frames[name] = scene_frames(self.tables, self.scenes[name], self.config.frame)
-        return self._frames[name]
+            if name not in self._frames:
+                self._frames[name] = scene_frames(self.tables, self.scenes[name], self.config.frame)
+            return self._frames[name]
 
     @cached_property
     def _fits(self) -> tuple[ImageFit | None, ...]:

@@ -68,7 +68,8 @@ def split_scenes(names: Iterable[str], split: Split, *, mini: bool, file: Path |
         have = ", ".join(f"{one} ({count} scenes)" for one, count in counts.items() if count) or "none of any split"
         raise UserError(
             f"split {split} has no scene in these tables, which hold {have if file is None else len(names)}: choose "
-            "another split, or name a file of splits"
+            "another split, name a file of splits, or, where tables of several versions lie side by side, the folder "
+            "of those meant, such as ROOT/v1.0-test"
         )
     return found
 

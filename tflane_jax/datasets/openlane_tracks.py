@@ -1,8 +1,8 @@
 """Traffic flow for OpenLane-V2: the tracks of the logs of which its segments are parts (TF-Lane, section 3.2).
 
 OpenLane-V2 holds no tracks. A segment of subset A is a part of an Argoverse 2 sensor log, whose id its files name; one
-of subset B is a scene of nuScenes, named or by its token. Frame and log share the city frame and the clock: the frame's
-time is that of the front camera, some 10 ms before the lidar frame in which boxes are annotated.
+of subset B is a scene of nuScenes, by its token (a name is read too). Frame and log share the city frame and the clock:
+the frame's time is that of the front camera, some 10 ms before the lidar frame in which boxes are annotated.
 """
 
 from __future__ import annotations

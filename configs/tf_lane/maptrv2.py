@@ -11,7 +11,7 @@ queries, and the mask of lines in BEV. There are no cameras, so that depth and t
 of 32 frames shows that the program runs and says nothing about accuracy.
 
 `tflane tables tf_lane.4`, 1,500 updates of `:street`, eight seeds: mAP 52.1 ± 1.5, recall of hidden lines that vehicles
-drove along 70.5 ± 2.1 percent.
+drove along 70.5 ± 2.1 percent, with masks in BEV of three cells; they are five cells wide since.
 """
 
 from dataclasses import fields, replace

@@ -8,7 +8,7 @@ from tflane_jax.ablations.paper import gtn_lane, markers, small_host, tf_lane
 from tflane_jax.ablations.paper.table import PaperTable
 from tflane_jax.errors import UserError
 
-_ALL = (*tf_lane.TABLES, tf_lane.LONG, tf_lane.MASKING, *gtn_lane.TABLES, *markers.TABLES, *small_host.TABLES)
+_ALL = (*tf_lane.TABLES, *tf_lane.LONG, tf_lane.MASKING, *gtn_lane.TABLES, *markers.TABLES, *small_host.TABLES)
 TABLES: dict[str, PaperTable] = {table.name: table for table in _ALL}
 
 

@@ -14,6 +14,7 @@ from tests.training.many_devices import BATCH, EVENLY, assignments, host_terms, 
 from tests.training.stub_run import run
 from tests.training.test_loop import arrays, timeless
 from tflane_jax.training.checkpoint import Checkpoints
+from tflane_jax.training.vectors import ROW
 
 
 @pytest.fixture(scope="module", params=with_slow([2, 8], quick=[2]))
@@ -69,6 +70,7 @@ def test_each_device_holds_its_part_of_a_shared_state(forced):
     devices, held = forced[1]["devices"], forced[1]["held"]
     assert {len(parts) for _, parts in held.values()} == {devices}
     assert all(parts == [size // devices] * devices for size, parts in held.values())
+    assert all(size % (devices * ROW) == 0 for size, _ in held.values())  # no leaf's row is cut
     assert len(held) == 2 * 4  # kernels and biases: parameters, average, two moments
 
 

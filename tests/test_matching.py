@@ -102,6 +102,24 @@ def test_diverged_costs_give_some_assignment():
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
+def test_a_cost_that_is_no_number_is_the_highest(backend):
+    got = match(jnp.array([[jnp.nan, 2.0], [5.0, jnp.nan], [jnp.nan, 1.0]]), jnp.ones(2, bool), backend)
+    assert got.query.tolist() == [1, 2]
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("offset", [-50.0, 50.0])
+def test_no_query_is_idle_where_targets_are_left_over(backend, offset):
+    """However much it costs: two queries, and three targets in five places."""
+    cost = offset + np.random.default_rng(4).uniform(size=(2, 5)).astype(np.float32)
+    valid = np.array([True, False, True, True, False])
+    got = match(jnp.asarray(cost), jnp.asarray(valid), backend)
+    rows, columns = linear_sum_assignment(cost[:, valid])
+    assert got.matched.sum() == 2
+    assert _total(cost, got) == pytest.approx(cost[:, valid][rows, columns].sum(), rel=1e-6)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
 def test_64_bit_mode_gives_the_same(backend):
     rng = np.random.default_rng(3)
     cost, valid = rng.normal(size=(3, 4, 6)).astype(np.float32), np.arange(6) < np.array([[6], [3], [0]])

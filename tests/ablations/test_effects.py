@@ -92,6 +92,34 @@ def test_findings(results):
     assert {e.finding for e in effects(results, strict, "", "last")} == {"not shown"}
 
 
+def test_numbers_read_as_errors_are_the_same_but_for_what_is_better(results):
+    for score, error in zip(
+        *(effects(results, DECLARED, "", "last", errors) for errors in ([], [PRIMARY])), strict=True
+    ):
+        for name in ("difference", "low", "high", "seeds_low", "seeds_high", "p"):
+            assert getattr(error, name) == pytest.approx(getattr(score, name), rel=1e-9), name
+        assert error.seeds_low < error.difference < error.seeds_high
+
+
+@pytest.mark.parametrize(("alpha", "finding"), [(0.0625, "not shown"), (0.0626, "shown")])
+def test_p_must_be_below_the_level(alpha, finding):
+    """Five seeds that differ by one number: the sign test gives 2^-4."""
+    found = Results(("baseline", "+TFM"), tuple(range(5)), {})
+    for seed in found.seeds:
+        for model, hits in (("baseline", (5, 5, 5)), ("+TFM", (7, 8, 9))):
+            ratio = SceneRatio(hits, (10, 10, 10))
+            found.add(
+                "",
+                "last",
+                model,
+                seed,
+                Measured(1, "a protocol", {"": {PRIMARY: sum(hits) / 30}}, {"": {PRIMARY: ratio}}),
+            )
+    (effect,) = effects(found, Declaration(PRIMARY, (Claim("+TFM"),), alpha=alpha), "", "last")
+    assert effect.p_holm == 0.0625
+    assert effect.finding == finding
+
+
 def test_an_effect_of_few_scenes_is_not_shown():
     """All seeds agree, but one scene makes the whole difference."""
     found = Results(("baseline", "+TFM"), SEEDS, {})

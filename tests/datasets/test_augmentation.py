@@ -252,6 +252,18 @@ def test_colours_are_mapped_rounded_and_clipped(monkeypatch):
     np.testing.assert_allclose(after.image, np.clip(exact, 0, 1) * 255, rtol=0, atol=0.99)
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_contrast_is_about_the_mean_grey_of_what_the_image_shows(seed):
+    """Padding, which is black, does not count: half an image beside padding changes as by itself."""
+    whole, half = example(), WIDTH // 2
+    valid = np.broadcast_to(np.arange(WIDTH) < half, whole.image_valid.shape)
+    contrast = replace(NO_AUGMENTATION, contrast=0.4)
+    padded = augment(replace(whole, image_valid=valid), contrast, seed)
+    alone = replace(whole, image=whole.image[:, :half], image_valid=np.ones_like(valid[:, :half]))
+    np.testing.assert_array_equal(padded.image[:, :half], augment(alone, contrast, seed).image)
+    assert (padded.image != whole.image)[:, :half].any()
+
+
 def test_lighting_reads_red_green_and_blue():
     """The components are orthonormal; the first, by far the largest, is grey with slightly more blue than red."""
     vectors = augmentation.PCA_VECTORS

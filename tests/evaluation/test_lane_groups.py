@@ -12,10 +12,11 @@ from tflane_jax.evaluation.lane_groups import (
     SAMPLES,
     driven_fraction,
     lane_groups,
+    line_groups,
     shown_fraction,
 )
 from tflane_jax.geometry import PerceptionRange, resample
-from tflane_jax.scene import BevChannel, LaneGraph, RoadUser, TrafficFlow
+from tflane_jax.scene import BevChannel, LaneGraph, LineClass, MapLines, RoadUser, TrafficFlow
 
 GROUND = PerceptionRange((-20.0, 20.0), (-10.0, 10.0))
 CELL = 0.5
@@ -168,3 +169,42 @@ def test_what_counts_as_evidence(channel, value, group):
 def test_a_frame_without_lanes_has_empty_groups():
     groups = lane_groups(LaneGraph.empty(3, 5), raster(), driving(10.0, 0.0), GROUND)
     assert {name: len(group) for name, group in groups.items()} == dict.fromkeys(LANE_GROUPS, 0)
+
+
+def test_the_tolerance_is_in_metres_on_cells_of_any_shape():
+    """Cells of 1 m across and 0.5 m along the lane."""
+    side = straight_lanes(0.5).points[1:]
+    for row, shown in ((10, 1.0), (11, 1.0), (12, 0.0)):
+        bev = np.zeros((20, 80, len(BevChannel)), np.uint8)
+        bev[row, :, BevChannel.LANE_PAINT] = 255
+        np.testing.assert_array_equal(shown_fraction(side, side, bev, GROUND), [shown])
+
+
+def test_a_vehicle_turns_between_two_frames():
+    """From 50 degrees to the right to 50 to the left over 20 m: within 30 degrees on the 12 m in the middle."""
+    flow = driving(10.0, 0.0)
+    flow.position[0, 1], flow.yaw[0, :2] = flow.position[0, 2], np.radians([-50.0, 50.0])
+    flow.valid[0, 2] = False
+    along = np.abs(np.linspace(-10.0, 10.0, SAMPLES)) <= 6.0
+    np.testing.assert_allclose(driven_fraction(straight_lanes(0.0).points[1:], flow)[0], [along.mean()])
+
+
+@pytest.mark.parametrize(
+    ("y", "expected"),
+    [
+        (2.7, ["hidden+traffic"]),
+        (2.8, []),
+        (3.4, []),
+        (3.6, ["hidden-traffic"]),
+        (6.9, ["hidden-traffic"]),
+        (7.1, ["hidden-traffic", "hidden-neighbours"]),
+    ],
+)
+@pytest.mark.parametrize("yaw", [0.0, np.pi])
+def test_traffic_beside_a_line(y, yaw, expected):
+    """A line has the lanes on both its sides, and traffic in either direction."""
+    lines = MapLines.empty(2, 5)
+    lines.points[:] = np.nan
+    lines.points[1], lines.category[1], lines.valid[1] = straight_lanes(0.0).points[1], LineClass.DIVIDER, True
+    groups = line_groups(lines, raster(), driving(10.0, y, yaw=yaw), GROUND)
+    assert [name for name in LANE_GROUPS if groups[name][0]] == expected

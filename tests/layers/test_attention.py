@@ -252,6 +252,22 @@ def test_module_without_keys_is_zero(module):
     np.testing.assert_allclose(out[0], module.apply(params, query, key, key)[0], rtol=1e-5, atol=1e-6)
 
 
+def test_a_slot_is_unseen_only_if_no_head_sees_it(module):
+    """Heads with windows of their own: a query that one head alone answers keeps that answer."""
+    module, params, query, key = module
+    mask = jnp.zeros((2, 6, 5), bool).at[1, :4, :3].set(True).at[0, 0, 4].set(True)
+    weights = jax.tree.map(np.asarray, params["params"])
+    q, k, v = (
+        (np.asarray(x) @ weights[name]["kernel"] + weights[name]["bias"]).reshape(len(x), 2, 4).swapaxes(0, 1)
+        for name, x in (("query", query), ("key", key), ("value", key))
+    )
+    heads = loop_attention(q, k, v, mask)[0].swapaxes(0, 1).reshape(6, 8)
+    expected = heads @ weights["output"]["kernel"] + weights["output"]["bias"]
+    out = module.apply(params, query, key, key, mask)
+    np.testing.assert_allclose(out[:4], expected[:4], rtol=1e-5, atol=1e-5)
+    assert not np.any(out[4:])
+
+
 def test_module_ignores_masked_slots_in_parameter_gradients(module):
     module, params, query, key = module
     valid_query, valid_key = jnp.arange(6) != 2, jnp.arange(5) < 3

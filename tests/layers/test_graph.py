@@ -133,3 +133,15 @@ def test_scene_graph_is_equivariant_and_works_without_lanes():
 
 def test_edges_carry_no_gradient():
     assert float(jax.grad(lambda z: edge_probabilities(z).sum())(jnp.ones((2, 2))).sum()) == 0.0
+
+
+def test_classes_of_elements_carry_no_gradient():
+    rng = np.random.default_rng(2)
+    features, logits, edges = (jnp.asarray(rng.normal(size=shape), jnp.float32) for shape in ((3, 4), (3, 2), (5, 3)))
+    module = ElementGraphConvolution(6)
+    params = module.init(jax.random.key(0), ElementNodes(features, logits, edges))
+    by_nodes = jax.grad(lambda nodes: jnp.square(module.apply(params, nodes)).sum())
+    found = by_nodes(ElementNodes(features, logits, edges))
+    assert not found.logits.any()
+    assert found.features.any()
+    assert found.edges.any()

@@ -82,6 +82,11 @@ def test_a_place_attends_to_lines_within_the_radius(seed, radius):
     np.testing.assert_array_equal(mask[clear], ((expected <= radius) & valid)[clear])
 
 
+def test_a_line_at_the_radius_itself_is_within_it():
+    places = jnp.array([[3.0, 4.0], [-5.0, 0.0], [3.0, 4.25]])
+    np.testing.assert_array_equal(radius_mask(places, jnp.zeros((1, 1, 2)), jnp.ones(1, bool), 5.0)[:, 0], [1, 1, 0])
+
+
 def test_a_line_without_length_is_a_point():
     mask = radius_mask(jnp.array([[3.0, 0.0], [3.1, 0.0]]), jnp.zeros((1, 2, 2)), jnp.ones(1, bool), 3.05)
     np.testing.assert_array_equal(mask, [[True], [False]])

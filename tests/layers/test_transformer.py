@@ -4,12 +4,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.special import erf
 
 from tests.converted import converted_params
 from tests.golden import batch_leading, case_id, golden_modules, implemented, load_module_case, options
 from tests.golden_compare import compare
+from tests.parameters import random_params
+from tests.shared import random_array
 from tflane_jax.convert.lstr import DECODER_LAYER, ENCODER_LAYER
-from tflane_jax.layers.transformer import DecoderLayer, EncoderLayer, TransformerConfig
+from tflane_jax.layers.transformer import DecoderLayer, EncoderLayer, FeedForward, TransformerConfig
 
 # The fixtures' names of PyTorch's masks.
 SELF_MASK = {"torch_encoder_layer": ("src_mask", "attn_mask", "mask"), "torch_decoder_layer": ("tgt_mask",)}
@@ -96,3 +99,26 @@ def test_encoder_layer_matches_pytorch(path):
 @pytest.mark.parametrize("path", golden_modules("torch_decoder_layer*"), ids=case_id)
 def test_decoder_layer_matches_pytorch(path):
     check_decoder_layer(load_module_case(path))
+
+
+def test_positions_are_in_queries_and_keys_but_not_in_values():
+    """A token alone attends to itself whatever its position is, so that only a value could show it."""
+    config = TransformerConfig(2, 8, 0.0)
+    x, memory, there, elsewhere = (random_array(seed, 2, 4) for seed in range(4))
+    encoder, decoder = EncoderLayer(config), DecoderLayer(config)
+    of_encoder, of_decoder = random_params(encoder.init, x, there), random_params(decoder.init, x, memory, there, there)
+    for count, same in ((1, True), (2, False)):
+        few, tokens, here, away = (leaf[:count] for leaf in (x, memory, there, elsewhere))
+        encoded = [encoder.apply(of_encoder, few, place) for place in (here, away)]
+        assert np.allclose(*encoded, atol=1e-6) is same
+        places = (here, here), (away, away)
+        assert np.allclose(*(decoder.apply(of_decoder, few, tokens, *both) for both in places), atol=1e-6) is same
+
+
+def test_gelu_is_the_exact_one():
+    """As PyTorch's by default; its approximation by tanh differs by up to 5e-4."""
+    x = jnp.linspace(-4.0, 4.0, 80).reshape(20, 4)
+    layer = {"kernel": jnp.eye(4), "bias": jnp.zeros(4)}
+    block = FeedForward(TransformerConfig(1, 4, 0.0, activation="gelu"))
+    found = block.apply({"params": {"expand": layer, "contract": layer}}, x, deterministic=True)
+    np.testing.assert_allclose(found, x * 0.5 * (1.0 + erf(np.asarray(x) / np.sqrt(2.0))), atol=2e-6)

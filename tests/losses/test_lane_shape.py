@@ -72,6 +72,20 @@ def test_few_lines(count):
         np.testing.assert_array_equal(gradient.curves, np.zeros_like(gradient.curves))
 
 
+def test_a_line_without_a_query_does_not_weigh_on_the_others():
+    """One query and two lines: the short one, far away, is not matched, so that the other one weighs 1."""
+    truth = lines(batch=1, count=2)
+    truth = truth.replace(
+        points=truth.points.at[:, 1, :, 0].add(9.0),
+        point_valid=truth.point_valid.at[:, 0].set(True).at[:, 1].set(jnp.arange(POINTS) >= POINTS - 2),
+    )
+    one = jax.tree.map(lambda leaf: leaf[:, :, :1], predictions(batch=1))
+    both, alone = (value_and_gradient(one, truth.replace(valid=jnp.arange(LINES)[None] < count)) for count in (2, 1))
+    assert both[1]["matching/lanes"] == 1.0
+    np.testing.assert_allclose(2.0 * both[1]["curve"], alone[1]["curve"], rtol=1e-5)  # sums are divided by all lines
+    assert alone[1]["curve"] > 0.01
+
+
 def test_the_order_of_lines_and_queries_does_not_matter():
     truth, prediction = lines(), predictions()
     turn = lambda tree, order, axis: jax.tree.map(lambda leaf: jnp.take(leaf, order, axis), tree)  # noqa: E731

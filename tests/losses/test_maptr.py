@@ -247,6 +247,13 @@ def test_coinciding_points_have_a_direction_with_a_bounded_gradient(least_step, 
     assert most / 4 < np.abs(gradient).max() < most
 
 
+def test_the_nearest_order_is_so_in_fractions_of_the_range():
+    """3 m along the 60 m of the range are less than 2 m along its 30 m."""
+    orders = jnp.array([[[[3.0, 0.0]] * 4, [[0.0, 2.0]] * 4]])
+    targets = LineTargets(orders, jnp.ones((1, 2), bool), jnp.zeros(1, int), jnp.ones(1, bool))
+    np.testing.assert_array_equal(nearest_order(jnp.zeros((1, 4, 2)), targets, RANGE), orders[:, 0])
+
+
 def test_quality_falls_with_the_mean_distance_of_the_nearest_order():
     truth = np.zeros((2, 4, 2), np.float32)
     moved = truth.copy()

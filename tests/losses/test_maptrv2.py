@@ -60,3 +60,20 @@ def test_no_room_for_lines_equals_no_lines():
         np.testing.assert_allclose(terms[name], value, rtol=1e-6, err_msg=name)
     assert (expected["class"] > 0.0).all()
     assert not expected["points"].any()
+
+
+def test_every_line_is_learned_as_often_as_it_is_repeated():
+    """Three queries lie on each of two lines, which therefore cost nothing but their class."""
+    along = np.linspace(-6.0, 6.0, 5)
+    truth = MapLines.empty(3, 5)
+    for i in (0, 1):
+        truth.points[i, :, 0], truth.points[i, :, 1], truth.valid[i] = along, 4.0 * i, True
+    targets = jax.vmap(lambda one: line_targets(one, 2, 3))(stack_examples([truth]))
+    points = jnp.asarray(truth.points[[0, 1, 1, 0, 0, 1], :, :2])[None, None]
+    config = MapTrV2LossConfig(many_repeats=3)
+    run = jax.jit(lambda points: one_to_many_losses(LinePrediction(points, zeros), targets, HOST.bev_range, config))
+    zeros = jnp.zeros((1, 1, 6, 3))
+    terms, moved = run(points), run(points.at[0, 0, 0].add(1.0))
+    np.testing.assert_allclose(terms["points"], 0.0, atol=1e-6)
+    np.testing.assert_allclose(terms["direction"], 0.0, atol=1e-6)
+    assert (moved["points"] > 1e-3).all()

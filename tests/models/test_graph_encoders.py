@@ -268,6 +268,17 @@ def test_small_maps(name, shape):
     assert np.isfinite(out).all()
 
 
+def test_the_weights_of_meta_paths_do_not_depend_on_the_number_of_cells():
+    """Semantic attention is over the mean of all cells (Eq. 7): a map repeated in rows and columns has the same."""
+    module = HeterogeneousAttention(HanEncoderConfig(semantic=8, relations=("row", "column")))
+    x, position, valid = scene()
+    params = random_params(module.init, x, position, valid, spread=1.0)
+    repeated = (jnp.tile(leaf, (2, 2, 1)[: leaf.ndim]) for leaf in (x, position, valid))
+    out, often = module.apply(params, x, position, valid), module.apply(params, *repeated)
+    shown = np.tile(valid, (2, 2))
+    np.testing.assert_allclose(often[shown], np.tile(out, (2, 2, 1))[shown], rtol=1e-4, atol=1e-5)
+
+
 def test_dropout_is_seeded():
     """Dropout of the encoder layer that all graphs have in common."""
     module, variables = built(dataclasses.replace(CONFIGS["gcn"], layers=1))

@@ -11,9 +11,16 @@ from hypothesis import strategies as st
 from scipy.stats import qmc
 
 from tests.models.cases import BASELINE
-from tests.parameters import zero_params
+from tests.parameters import random_params, zero_params
 from tflane_jax.geometry import BevGrid, PerceptionRange
-from tflane_jax.models.lane_decoder import LaneHeads, PointwiseRefinement, clip_with_return, directions, smooth_basis
+from tflane_jax.models.lane_decoder import (
+    LaneHeads,
+    PointwiseRefinement,
+    clip_with_return,
+    directions,
+    next_reference,
+    smooth_basis,
+)
 from tflane_jax.models.lane_queries import spread_lanes
 
 RANGE = BevGrid().range
@@ -75,6 +82,28 @@ def test_pointwise_refinement_starts_at_zero_and_looks_only_where_the_point_is()
     before, after = (np.asarray(apply(params, queries, reference, b)) for b in (bev, other))
     np.testing.assert_array_equal(before[0], after[0])
     assert not np.allclose(before, after)
+
+
+def test_pointwise_refinement_sees_headings_in_metres():
+    """Beside equal features, a lane moves alike in boxes of any shape."""
+    config = BASELINE.decoder
+    rng = np.random.default_rng(1)
+    lane = np.stack([np.linspace(-8, 8, config.points), np.linspace(-2, 6, config.points), np.zeros(config.points)], -1)
+    queries, bev = jnp.asarray(rng.normal(size=(1, config.dim)), jnp.float32), jnp.ones((4, 8, 5))
+    found = []
+    for box in (RANGE, PerceptionRange((-20.0, 20.0), (-40.0, 40.0), (-2.3, 1.7))):
+        module, reference = PointwiseRefinement(config, box), jnp.asarray(box.normalise(lane[None]), jnp.float32)
+        found.append(module.apply(random_params(module.init, queries, reference, bev), queries, reference, bev))
+    np.testing.assert_allclose(*found, rtol=1e-4, atol=1e-5)
+    assert np.abs(found[0]).max() > 0.01
+
+
+@pytest.mark.parametrize("refine", ["fixed", "iterative"])
+def test_the_next_layer_begins_at_the_refined_lane_and_teaches_this_one_nothing(refine):
+    config = dataclasses.replace(BASELINE.decoder, refine=refine)
+    before, after = jnp.full((2, config.points, 3), 0.2), jnp.full((2, config.points, 3), 0.7)
+    np.testing.assert_array_equal(next_reference(before, after, config), before if refine == "fixed" else after)
+    assert not jax.grad(lambda unit: next_reference(before, unit, config).sum())(after).any()
 
 
 def metric_heads(reference, unit_change, limits=None):

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,9 +13,10 @@ from tests.parameters import random_params
 from tests.slow import with_slow
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.losses.toponet import TopoNetLossConfig, lane_denoising_losses
+from tflane_jax.models.auxiliary import AUXILIARY
 from tflane_jax.models.bevformer_detr import BevFormerDetrConfig
-from tflane_jax.models.lane_denoising import DenoisingConfig, noised_lanes
-from tflane_jax.scene import CenterlinePrediction, LaneGraph, stack_examples
+from tflane_jax.models.lane_denoising import DenoisingConfig, decode_groups, noised_lanes
+from tflane_jax.scene import CenterlinePrediction, LaneGraph, Prediction, stack_examples
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 
 RANGE = PerceptionRange()
@@ -47,6 +49,8 @@ def test_without_noise_lanes_stay_and_other_queries_lie_in_the_range():
     ("change", "same"),
     [
         ({"shift": 2.0}, lambda line: line - line.mean(0)),
+        ({"shift": 2.0}, lambda line: line[:, 2]),
+        ({"turn": 0.5}, lambda line: line[:, 2]),
         ({"turn": 0.5}, lambda line: np.linalg.norm(line[:, None] - line[None], axis=-1)),
         ({"stretch": 0.5}, lambda line: (line - line.mean(0)) / np.linalg.norm(line[-1] - line[0])),
         ({"straighten": 1.0}, lambda line: line[[0, -1]]),
@@ -85,6 +89,38 @@ def test_a_query_belongs_to_its_own_lane():
     # Lanes 0 and 1 lie three metres apart, and there are three.
     points = denoising_losses(swapped, lanes, TopoNetLossConfig(points_weight=1.0))["points"]
     np.testing.assert_allclose(points, 2 * 33.0 / 3, rtol=1e-5)
+
+
+class Echo(nn.Module):
+    """A host whose predictions are its queries."""
+
+    dropout: float = 0.0
+
+    @nn.compact
+    def __call__(self, start, noised):
+        return decode_groups(self, start, noised, None, None, {}, True)
+
+    def decode_queries(self, start, bev, elements, tokens, deterministic):
+        points = nn.Dropout(self.dropout, deterministic=False, name="dropout")(start)
+        return Prediction(centerlines=CenterlinePrediction(points, points[..., 0, :1]))
+
+
+def test_learned_queries_are_predicted_and_all_copies_taught():
+    start = jax.random.normal(KEY, (4, 11, 3))
+    noised = start[None] + jnp.arange(1.0, 4.0)[:, None, None, None]
+    found, state = Echo().apply({}, start, noised, mutable=AUXILIARY)
+    np.testing.assert_array_equal(found.centerlines.points, start)
+    (taught,) = state[AUXILIARY]["denoised"]
+    np.testing.assert_array_equal(taught.points, noised)
+
+
+def test_each_copy_drops_features_of_its_own():
+    ones = jnp.ones((3, 4, 11, 3))
+    found, state = Echo(0.5).apply({}, ones[0], ones[1:], mutable=AUXILIARY, rngs={"dropout": KEY})
+    (taught,) = state[AUXILIARY]["denoised"]
+    kept = np.concatenate([found.centerlines.points[None], taught.points]) > 0
+    for i, j in ((0, 1), (0, 2), (1, 2)):
+        assert 0.3 < (kept[i] == kept[j]).mean() < 0.7
 
 
 HOSTS = {

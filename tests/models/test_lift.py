@@ -1,5 +1,7 @@
 """The lift of image features into BEV against the reference's numbers; geometry, borders, cameras."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,7 +14,7 @@ from tests.parameters import random_params
 from tflane_jax.convert.maptr import LIFT
 from tflane_jax.convert.renaming import convert
 from tflane_jax.errors import UserError
-from tflane_jax.geometry import BevGrid, PerceptionRange
+from tflane_jax.geometry import BevGrid, PerceptionRange, yaw_pose
 from tflane_jax.layers.depth_net import DepthNet
 from tflane_jax.limits import check_settings
 from tflane_jax.losses.map_masks import depth_targets
@@ -21,7 +23,7 @@ from tflane_jax.models.auxiliary import LineMaskHead
 from tflane_jax.models.lift import LiftConfig, LiftEncoder, camera_vector, cell_numbers, collect, ray_points
 from tflane_jax.models.traffic_raster import TrafficRasterConfig, TrafficRasterFusion
 from tflane_jax.priors.traffic_raster import CHANNELS, TrafficRaster
-from tflane_jax.scene import CameraViews
+from tflane_jax.scene import CameraViews, VehicleState
 
 
 @pytest.mark.golden
@@ -179,6 +181,33 @@ def test_points_outside_the_range_belong_to_no_cell_but_for_the_published_border
     points = jnp.concatenate([points, jnp.full((1, 3), jnp.nan)])
     assert cell_numbers(points, GRID, "exact").tolist() == [0, 32, 32, 31, 32, 32]
     assert cell_numbers(points, GRID, "published").tolist() == [0, 0, 32, 31, 32, 32]
+
+
+def test_the_lower_borders_of_the_range_belong_to_its_cells_and_the_upper_ones_do_not():
+    """A point on the upper border would count in the next row."""
+    points = jnp.array([[-8.0, -4.0, -3.0], [8.0, -4.0, 0.0], [-8.0, 4.0, 0.0], [0.0, 0.0, 3.0], [-8.0, 0.0, 0.0]])
+    assert cell_numbers(points, GRID, "exact").tolist() == [0, 32, 32, 32, 16]
+
+
+class Shown(LiftEncoder):
+    """The lift, which shows what its depth network learns of the cameras."""
+
+    def encode(self, features, cameras, points, valid=None, *, train, fuse=None):
+        return cameras
+
+
+def test_the_depth_network_knows_cameras_by_their_native_images_and_the_vehicles_own_frame():
+    """Images are half the size of the native ones; the rear axle lies 1.4 m ahead of the example's frame, turned."""
+    raised = np.asarray(yaw_pose(np.float32(-1.4), np.float32(0.2), np.float32(0.1)), np.float32)
+    views = make_views()
+    views = views.replace(vehicle=VehicleState(np.eye(4, dtype=np.float32), raised))
+    model = Shown(replace(CONFIG, image_scale=0.5))
+    vector = model.apply({}, jnp.ones((2, 4, 6, 8)), views, train=False, method="lift")
+    for camera in (0, 1):
+        np.testing.assert_allclose(vector[camera, :4], [40.0, 40.0, 48.0, 32.0], rtol=1e-5)
+        np.testing.assert_allclose(vector[camera, 4:10], [0.5, 0.0, 0.0, 0.0, 0.5, 0.0], rtol=1e-5)
+        pose = raised @ np.linalg.inv(views.camera_from_ego[camera])
+        np.testing.assert_allclose(vector[camera, 10:], pose[:3].ravel(), atol=1e-5)
 
 
 def test_cameras_may_change_places_and_a_missing_one_may_hold_anything():

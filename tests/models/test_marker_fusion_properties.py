@@ -1,6 +1,7 @@
 """What holds for every variant of marker fusion: no markers, padding, order of lanes, motion of the vehicle."""
 
 from dataclasses import replace
+from functools import partial
 
 import flax.linen as nn
 import jax
@@ -20,6 +21,7 @@ from tflane_jax.models.marker_fusion import (
     MarkerFusionConfig,
     MarkerPrior,
     MarkerTokens,
+    as_fused,
     as_written,
     fusion_gate,
     uniform_fusion,
@@ -137,3 +139,29 @@ def test_remembered_lanes_stay_on_the_ground_on_any_drive(steps, turn):
     expected = points @ moved[:2, :2].T + moved[:2, 3]
     np.testing.assert_allclose(np.asarray(lanes.points)[np.asarray(lanes.valid)], expected, atol=1e-3)
     np.testing.assert_allclose(lanes.gate, first.gate * 0.5 ** len(steps), rtol=1e-5)
+
+
+def test_a_marker_at_the_threshold_is_used():
+    """Hard fusion ignores markers below the threshold."""
+    lanes = lanes_of(CONFIG, observed())
+    hard = replace(CONFIG, fusion="hard", hard_threshold=0.5)
+    for trust, used in ((0.5, lanes.valid), (0.49, jnp.zeros_like(lanes.valid))):
+        equal = lanes.replace(confidence=jnp.where(lanes.valid, trust, 0.0))
+        np.testing.assert_array_equal(fusion_gate(equal, hard)[1], used)
+
+
+@pytest.mark.parametrize("name", ["gated", "ungated", "hard"])
+def test_without_a_lane_to_attend_to_the_gate_is_closed(name):
+    lanes = lanes_of(VARIANTS[name], observed(valid=False))
+    assert as_fused(lanes, VARIANTS[name]).gate == 0.0
+    sure = lanes_of(VARIANTS[name], observed()).replace(confidence=jnp.ones(len(lanes.valid)))
+    assert as_fused(sure, VARIANTS[name]).gate > 0.0
+
+
+def test_cells_of_lanes_have_the_gate_of_the_variant():
+    """With c = 1 in Eq. (3), the frame's confidence does not reach the cells either."""
+    config = replace(CONFIG, fusion="uniform", norm="query", bev=MarkerRasterConfig(hidden=8))
+    module, lanes = OneLayer(config), lanes_of(config, observed())
+    fuse = jax.jit(partial(module.apply, random_params(module.init, lanes)))
+    doubtful, sure = (fuse(lanes.replace(gate=jnp.float32(gate))) for gate in (0.1, 0.9))
+    assert_same(doubtful, sure)

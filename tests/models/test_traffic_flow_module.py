@@ -85,6 +85,19 @@ def test_only_the_ends_tell_the_order_of_frames_without_ages(token, ordered):
     assert np.allclose(a, b, atol=1e-5) is not ordered
 
 
+@pytest.mark.parametrize("token", ["mean", "mean_and_ends"])
+def test_frames_missing_at_the_end_are_none_at_all(token):
+    """The mean is over the valid frames, and the last valid one is the end."""
+    module = TemporalEncoder(dataclasses.replace(CONFIG, token=token), DIM)
+    track = tokens(2, occluded_frames="keep")
+    seen = jnp.broadcast_to(jnp.arange(track.frame_valid.shape[1])[None] < 7, track.frame_valid.shape)
+    params = random_params(module.init, track)
+    found = apply(module, params, track.replace(frame_valid=seen))
+    short = track.replace(position=track.position[:, :7], heading=track.heading[:, :7], frame_valid=seen[:, :7])
+    params["params"]["age"] = params["params"]["age"][:7]
+    np.testing.assert_allclose(found, apply(module, params, short), rtol=1e-4, atol=1e-5)
+
+
 def test_sines_of_coordinates_in_metres():
     """Wavelengths are 200, 100 and 50 m in both directions, whatever the host's range."""
     wide = HostSpec(DIM, PerceptionRange((-90, 90)), PerceptionRange((-90, 90)))

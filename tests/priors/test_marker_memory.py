@@ -211,3 +211,23 @@ def test_a_stream_keeps_its_numbers_and_dtypes_in_64_bit_mode():
     for name, leaf in vars(used).items():
         assert leaf.dtype in (np.float32, bool)
         np.testing.assert_allclose(leaf, np.stack([getattr(one, name) for one in expected]), rtol=1e-5, atol=1e-6)
+
+
+def test_a_frame_at_the_threshold_is_trusted():
+    _, (_, used) = run([seen(0.9, at=5.0), seen(0.25, at=7.0)], replace(CONFIG, threshold=0.25))
+    np.testing.assert_array_equal(np.flatnonzero(used.valid), [0, 1])
+    assert used.gate == 0.25
+
+
+def test_remembered_places_of_the_plane_stay_where_they_are_if_the_vehicle_pitches():
+    """The bank has no heights: what counts are the points of the present plane, seen from the previous frame."""
+    cos, sin = np.cos(0.3), np.sin(0.3)
+    pitch, roll = np.eye(3), np.eye(3)
+    pitch[[0, 0, 2, 2], [0, 2, 0, 2]] = cos, sin, -sin, cos
+    roll[[1, 1, 2, 2], [1, 2, 1, 2]] = cos, -sin, sin, cos
+    pose = pose_matrix(pitch @ roll, np.array([2.0, -1.0, 0.0])).astype(np.float32)
+    places = np.array([[10.0, 3.0], [-4.0, 6.0]], np.float32)
+    before = seen(0.9, lanes=1)
+    before.points[0] = (np.c_[places, np.zeros(2), np.ones(2)] @ pose.T)[:, :2]
+    _, (_, used) = run([before, NOTHING], poses=[HERE, pose])
+    np.testing.assert_allclose(used.points[used.valid][0], places, atol=1e-4)

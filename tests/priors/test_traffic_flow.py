@@ -159,3 +159,13 @@ def test_order_of_instances_does_not_matter(seed, random):
 def test_a_sector_all_around_gives_every_instance_the_same_weight():
     places = np.array([[-9.0, 0.0], [-3.0, -1e-6], [4.0, 5.0], [0.0, 0.0]], np.float32)
     np.testing.assert_array_equal(ego_centric_weight(places, TrafficFlowPriorConfig(front_sector_deg=360.0)), 1.0)
+
+
+@pytest.mark.parametrize("frames", [1, 5, 20])
+def test_only_the_last_frames_count(frames):
+    """The selection is that of a recording which begins with them; what was hidden before does not matter."""
+    flow, config = make_flow(3), dataclasses.replace(CONFIG, frames=frames, min_valid_frames=1)
+    by_frame = {name: getattr(flow, name)[:, -frames:] for name in ("position", "yaw", "occluded", "valid")}
+    found, expected = select_traffic_flow(flow, config), select_traffic_flow(flow.replace(**by_frame), config)
+    assert found.frame_valid.any()
+    jax.tree.map(np.testing.assert_array_equal, found, expected)

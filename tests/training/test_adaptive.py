@@ -55,6 +55,7 @@ def test_a_metric_to_maximise():
     assert verdicts(values, config=config)[0] == "....E.R"
     # Numbers below zero: the sign of the goal decides, not that of the number.
     assert verdicts([-v for v in values])[0] == "....E.R"
+    assert verdicts([-1.0] * 10)[0] == "....RRRRR."  # nor is an equal number better
 
 
 def test_a_new_cycle_is_measured_by_itself_but_extended_for_a_record_of_the_run():

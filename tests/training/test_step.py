@@ -169,6 +169,26 @@ def test_parts_of_a_batch_give_the_step_of_the_whole_where_the_loss_is_a_mean_ov
     np.testing.assert_allclose(parts.statistics[STATISTICS]["mean"], expected, rtol=1e-6)
 
 
+class Draws(Quiet):
+    """The stub with a random number for its loss."""
+
+    def loss(self, params, batch, key):
+        loss, terms = super().loss(params, batch, key)
+        return 0.0 * loss + jax.random.normal(key), terms
+
+
+def test_parts_of_a_batch_have_random_numbers_of_their_own():
+    """Their mean over 32 parts is far smaller than one of them nearly always is; each step draws others."""
+    example = jax.tree.map(lambda leaf: leaf[0], ARRAYS)
+    [state] = init_states(Draws(), make_optimizer(OPTIM, STEPS), [0], example)
+    update, found = make_update_step(Draws(), OPTIM, STEPS, UpdateForm(donate=False, accumulate=32)), []
+    for step in range(4):
+        state, metrics = update(state, batch_of(0, step, size=32))
+        found.append(float(metrics["loss"]))
+    assert len(set(found)) == 4
+    assert np.sqrt(np.mean(np.square(found))) < 0.45  # expected 0.18; 1 with the same number in all parts
+
+
 @pytest.mark.parametrize(
     ("step", "decay", "expected"), [(0, 0.999, 0.1), (8, 0.999, 0.5), (10**6, 0.999, 0.999), (5, 0.0, 0.0)]
 )

@@ -23,6 +23,7 @@ from tflane_jax.cli import main
 from tflane_jax.config import RunConfig, SceneFileData
 from tflane_jax.config_io import from_json, to_json
 from tflane_jax.config_overrides import apply_overrides
+from tflane_jax.datasets import nuscenes_log
 from tflane_jax.datasets.base import ExampleConfig
 from tflane_jax.datasets.batches import batches
 from tflane_jax.datasets.map_lines import MapLinesConfig
@@ -240,7 +241,7 @@ def test_missing_and_strange_images_are_named(root):
         NuScenesDataset(NuScenesConfig(root, example=replace(SIZES, cameras=CameraRigConfig())))
 
 
-def test_false_places_are_errors(root):
+def test_false_places_are_errors(root, monkeypatch):
     """Else examples would hold no lane, or images of another place, and no one would know."""
     write_nuscenes(root, maps={"singapore-onenorth": other_city()})
     with pytest.raises(UserError, match="scene-0061 on the map of singapore-onenorth: the vehicle never comes within"):
@@ -248,6 +249,8 @@ def test_false_places_are_errors(root):
     write_nuscenes(root, maps={"singapore-onenorth": empty_city()})
     with pytest.raises(UserError, match="the map is empty or of another place"):
         opened(root).example(0)
+    monkeypatch.setattr(nuscenes_log, "MISPLACED", {"scene-0061"})
+    assert not opened(root).example(0).lanes.valid.any()
     content = tables()
     content["ego_pose"][4]["translation"] = [400.0, 1130.0, 0.0]
     dataset = opened(write_nuscenes(root, content), image=ImageConfig())

@@ -234,6 +234,15 @@ def test_the_official_splits():
         assert (official_split(name, mini=False), official_split(name, mini=True)) == (full, mini)
 
 
+def test_scenes_that_do_not_fit_the_map_may_be_left_out(tmp_path):
+    names = ["scene-0499", "scene-0500", "scene-0501", "scene-0502", "scene-0515", "scene-0517", "scene-0518"]
+    assert split_scenes(names, "train", mini=False) == names
+    assert split_scenes(names, "train", mini=False, misplaced="drop") == ["scene-0500", "scene-0518"]
+    file = tmp_path / "splits.json"
+    file.write_text(json.dumps({"train": names[:2]}))
+    assert split_scenes(names, "train", mini=False, file=file, misplaced="drop") == ["scene-0500"]
+
+
 def test_splits_of_a_users_own(tmp_path):
     names, file = ["scene-0103", "scene-0061"], tmp_path / "splits.json"
     assert split_scenes(names, "train", mini=True) == ["scene-0061"]

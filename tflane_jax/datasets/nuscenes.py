@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -71,6 +72,8 @@ class NuScenesConfig:
         split: official split by scene name; the official test split has no annotations.
         version: folder of the tables, such as "v1.0-mini"; None finds it, see `nuscenes_tables.find_tables`.
         splits: JSON file {split: [scene names]} in place of the official splits.
+        misplaced: whether to use five official scenes that do not fit the map, as MapTR does: "keep" or "drop", see
+            `nuscenes_splits.MISPLACED`.
         frame: origin of the examples: the vehicle's rear axle, or the lidar, as in MapTR (see
             `nuscenes_log.level_poses`). x is forward and y left in both.
         least_visibility: boxes of a lower level of visibility are `TrafficFlow.occluded`, as are those without lidar
@@ -90,6 +93,7 @@ class NuScenesConfig:
     split: Split = "train"
     version: str | None = None
     splits: Path | None = None
+    misplaced: Literal["keep", "drop"] = "keep"
     frame: ReferenceFrame = "ego"
     least_visibility: Visibility = "v0-40"
     camera_poses: CameraPoses = "exposure"
@@ -114,7 +118,9 @@ class NuScenesDataset:
             raise UserError("nuScenes has real cameras: set example.cameras=None and give `image`")
         self.tables = shared_tables(find_tables(config.root, config.version))
         scenes = self.tables.scenes()
-        names = split_scenes(scenes, config.split, mini=self.tables.mini, file=config.splits)
+        names = split_scenes(
+            scenes, config.split, mini=self.tables.mini, file=config.splits, misplaced=config.misplaced
+        )
         self.scenes = {name: scenes[name] for name in names}
         self._places = [(name, i) for name in names for i in range(len(self.tables.samples(scenes[name])))]
         self._frames: dict[str, SceneFrames] = {}
@@ -230,7 +236,8 @@ class NuScenesData:
     Attributes:
         root: folder of the data set.
         train, val, test: which official split serves as each; the official test split has no annotations.
-        version, splits, frame, least_visibility, camera_poses, can_bus, image, example, loading: see `NuScenesConfig`.
+        version, splits, misplaced, frame, least_visibility, camera_poses, can_bus, image, example, loading: see
+            `NuScenesConfig`.
         depth_cell: the same, of training images; others need no depth.
         augmentation: of training images, or None.
     """
@@ -241,6 +248,7 @@ class NuScenesData:
     test: Split = "val"
     version: str | None = None
     splits: Path | None = None
+    misplaced: Literal["keep", "drop"] = "keep"
     frame: ReferenceFrame = "ego"
     least_visibility: Visibility = "v0-40"
     camera_poses: CameraPoses = "exposure"

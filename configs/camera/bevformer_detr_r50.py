@@ -6,8 +6,8 @@
         --training.init-from runs/imagenet --training.init-partly
 
 Encoder and training are those of `toponet_r50.py`; control points, loss weights, image sizes and augmentation (without
-GridMask) are the baseline's, which keeps all logs and frames without lanes; the published code distorts images after
-normalising them, by 32 standard deviations; here before.
+GridMask) are the baseline's. As there, logs whose streets differ from their map and frames without lanes are kept. The
+published code distorts images after normalising them, by up to 32 standard deviations; here they are distorted before.
 `:remat` recomputes activations in the backward pass, `:bfloat16` does so in half precision.
 """
 

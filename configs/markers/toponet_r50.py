@@ -81,10 +81,13 @@ def _row(priors: PriorsConfig, host: str = "toponet_r50") -> RunConfig:
     sd_map = None if priors.sd_map is None else SdMapConfig()
     example = replace(config.data.example, markers=MarkerConfig(), sd_map=sd_map)
     boards = BoardsConfig(placement=PlacementConfig(per="scene", site="clear"))
+    model = _recomputing(_bev(config.task.model), priors)
+    data = replace(config.data, image=BASELINE_LARGE, augmentation=AUGMENTATION, example=example, boards=boards)
     return replace(
         config,
-        task=replace(config.task, model=_recomputing(_bev(config.task.model), priors), clip=CLIP, time="scan"),
-        data=replace(config.data, image=BASELINE_LARGE, augmentation=AUGMENTATION, example=example, boards=boards),
+        # All rows train on the same frames, as those of TopoNet; OpenLane-V2's baseline would keep more.
+        task=replace(config.task, model=model, clip=CLIP, time="scan", empty_frames="skip"),
+        data=replace(data, map_changes="drop"),
         optim=replace(config.optim, lr=1e-4, epoch_steps=EPOCH),
         training=replace(
             config.training,

@@ -43,6 +43,8 @@ def test_one_seed_has_no_test():
 def test_differences_without_spread():
     assert paired_difference([1.0, 2.0], [1.0, 2.0]).p_value == 1.0
     assert paired_difference([2.0, 3.0], [1.0, 2.0]).p_value == 0.5  # two coins that fall alike
+    assert all(map(math.isnan, paired_difference([2.0, 3.0], [1.0, 2.0]).interval()))
+    assert paired_difference([1.0, 2.0], [1.0, 2.0]).interval() == (0.0, 0.0)
     # Equal shares of few lanes, which differ by the rounding of their subtraction.
     same = paired_difference([0.5, 0.8, 0.3], [0.4, 0.7, 0.2])
     assert (same.mean, same.std, same.p_value, same.better) == (pytest.approx(0.1), 0.0, 0.25, 3)

@@ -186,6 +186,16 @@ def test_frames_without_elements_have_no_loss_of_elements_where_that_is_skipped(
         np.testing.assert_array_equal(report[name], keep[name])
 
 
+def test_the_count_of_skipped_frames_is_at_least_that_of_frames():
+    """The published mean over devices of one frame each, at least 1, is taken before empty frames are left out."""
+    prediction, lanes, elements = make_elements(1, (1, 0, 0), related=LAYERS)
+    skip = TopoNetLossConfig(elements=ElementLossConfig(empty_frames="skip"))
+    (_, keep), _ = value_and_gradient(prediction, lanes, elements, SIZES, TopoNetLossConfig())
+    (_, report), _ = value_and_gradient(prediction, lanes, elements, SIZES, skip)
+    for name in ("element_box", "element_iou"):  # one matched element, three frames
+        np.testing.assert_allclose(report[name], keep[name] / 3.0, rtol=1e-6)
+
+
 def test_no_room_for_elements_equals_no_elements():
     prediction, lanes, elements = make_elements(1, (0, 0, 0), related=LAYERS)
     none = jax.tree.map(lambda leaf: leaf[:, :0], elements.replace(lane=elements.lane.swapaxes(1, 2)))

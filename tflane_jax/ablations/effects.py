@@ -58,7 +58,7 @@ class Effect:
         mean, std: of the other row, over seeds; the standard deviation with n - 1, NaN for one seed.
         difference: treatment minus the other row, mean over seeds.
         low, high: 95 % interval of the difference over scenes, the seeds averaged; NaN where there is none.
-        seeds_low, seeds_high: 95 % t interval over seeds, on these scenes; NaN for one seed.
+        seeds_low, seeds_high: 95 % t interval over seeds, on these scenes; NaN where `PairedDifference.interval` is.
         p, p_holm: of the two-sided paired t-test over seeds, and corrected for all of this measure and checkpoint.
         better: number of seeds in which the treatment is better.
         seeds: that both rows have.

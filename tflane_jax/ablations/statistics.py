@@ -32,9 +32,14 @@ class PairedDifference:
     seeds: int
 
     def interval(self, level: float = 0.95) -> tuple[float, float]:
-        """Return the t interval of the mean difference over seeds; NaN for a single seed."""
+        """Return the t interval of the mean difference over seeds.
+
+        NaN for a single seed, and where all seeds differ by the same number, other than 0.
+        """
         from scipy.stats import t
 
+        if self.std == 0.0 and abs(self.mean) > _ROUNDING:
+            return math.nan, math.nan
         half = float(t.ppf((1 + level) / 2, self.seeds - 1)) * self.std / math.sqrt(self.seeds)
         return self.mean - half, self.mean + half
 

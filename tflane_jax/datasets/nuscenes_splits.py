@@ -63,9 +63,9 @@ def split_scenes(
     Args:
         names: scenes of the tables.
         split: train, val or test.
-        misplaced: what becomes of `MISPLACED` scenes.
         mini: whether the tables are v1.0-mini's.
         file: JSON file {"train": [scene names], "val": [...], ...} in place of the official splits.
+        misplaced: what becomes of `MISPLACED` scenes.
 
     Raises:
         UserError: the file is malformed, lacks the split or names a scene that the tables lack; or the split is empty.

@@ -29,7 +29,8 @@ class ElementLossConfig:
         class_weight, box_weight, iou_weight: of class, L1 and generalised IoU.
         alpha, gamma: parameters of the focal terms.
         empty_frames: frames without elements. "keep": their queries are negatives of the class loss; "skip": they have
-            no loss, as in the published training, where every device has one frame.
+            no loss, and losses are divided by the number of frames where that is larger than that of matched elements,
+            as in the published training, where every device has one frame.
     """
 
     class_weight: PositiveOrZero = 1.0
@@ -102,9 +103,11 @@ def element_losses(
     prediction = prediction.replace(lane_logits=None)  # pyright: ignore[reportAttributeAccessIssue]
     each = jax.vmap(partial(element_terms, config=weights), in_axes=(0, 0, None, None))
     classes, boxes, apart = jax.vmap(each)(prediction, assignment, elements, size)  # each (B, D)
+    count = positives(assignment)
     if weights.empty_frames == "skip":
         classes = jnp.where(elements.valid.any(-1)[:, None], classes, 0.0)  # the other two are 0 there
-    count = positives(assignment)
+        # The published count is a mean over devices of one frame, those without elements among them, and at least 1.
+        count = jnp.maximum(count, float(elements.valid.shape[0]))
     return {
         "element_class": weights.class_weight * classes.sum(0) / count,
         "element_box": weights.box_weight * boxes.sum(0) / count,

@@ -34,7 +34,7 @@ _LAST_STATE = 3
 
 @dataclass(frozen=True)
 class Author:
-    """What the server asks of a submission; what is empty is left out of the file, which it may not take then.
+    """What the server asks of a submission; empty fields are left out of the file, which is then not valid there.
 
     Attributes:
         method: its name.

@@ -8,10 +8,12 @@
 The reference trains 24 epochs of 22,477 frames on eight GPUs, one frame each, so that class losses are divided by the
 lanes of a frame, and frames without traffic elements have no loss of them. It draws another frame in place of one
 without lanes. Its first release trains on all logs; its configuration of subset B and later copies, as here, leave out
-four whose streets differ from their map. `:remat` recomputes activations in the
-backward pass, `:bfloat16` does so in half precision, `:six_layers` has six encoder layers instead of TopoNet's three.
-`:published_weights` evaluates as the published code does: each frame alone, with the numbers of its pose that the
-weights read (`datasets.openlane_can_bus`), and pixels of all cameras divided by the size of the front camera's crop.
+four whose streets differ from their map.
+
+`:remat` recomputes activations in the backward pass, `:bfloat16` does so in half precision, `:six_layers` has six
+encoder layers instead of TopoNet's three. `:published_weights` evaluates as the published code does: each frame alone,
+with the numbers of its pose that the weights read (`datasets.openlane_can_bus`), and pixels of all cameras divided by
+the size of the front camera's crop.
 """
 
 from dataclasses import replace

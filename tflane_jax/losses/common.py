@@ -185,7 +185,7 @@ def over_matched(
 
     Args:
         weight: of the term.
-        sums: of the class losses.
+        sums: of one loss, over the queries.
         assignment: (B, D, N).
         mean: "batch": all sums are divided by `positives`. "frame": each sum by the number of its own example, at least
             1, and the quotients are averaged, as published code with one example on each device does.

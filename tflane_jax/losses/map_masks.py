@@ -2,9 +2,9 @@
 
 MapTRv2 draws its masks with OpenCV: in BEV with OpenCV's thickness 3, which covers five cells, in the images with lines
 of one cell of the feature map. Here a cell belongs to a line that passes through it, and BEV masks are dilated by the
-disc of five cells that OpenCV draws around a point. Lines are taken at their dense points where the labels have them,
-100 on each (the published code draws the original vertices in BEV, 200 points in the images). A line that leaves the
-image or passes behind the camera is cut there (the published code joins what remains by a straight line).
+disc, five cells across, that OpenCV draws around a point. Lines are taken at their dense points where the labels have
+them, 100 on each (the published code draws the original vertices in BEV, 200 points in the images). A line that leaves
+the image or passes behind the camera is cut there (the published code joins what remains by a straight line).
 """
 
 from __future__ import annotations

@@ -55,14 +55,45 @@ def configurations() -> dict[str, RunConfig]:
     return found
 
 
-@pytest.mark.parametrize("name", shipped())
+def changed_settings(text: str, base: str) -> str:
+    """Return the lines of `to_text` that differ between an ablation and its file's configuration, by setting."""
+    kept, found = base.splitlines(), text.splitlines()
+    lines = [f"- {line}" for line in kept if line not in set(found)]
+    lines += [f"+ {line}" for line in found if line not in set(kept)]
+    return "".join(
+        f"{line}\n" for line in sorted(lines, key=lambda line: (line[2:].partition(" = ")[0], line[0] == "+"))
+    )
+
+
+@functools.cache
+def golden_texts() -> dict[str, str]:
+    """Return the golden text of each file below configs/: its configuration, and what each ablation changes."""
+    texts: dict[str, str] = {}
+    for name, reference in shipped().items():
+        text, (_, _, ablation) = to_text(configurations()[name]), reference.partition(":")
+        if ablation:
+            file = name.removesuffix(f".{ablation}")
+            texts[file] += f"\n:{ablation}\n{changed_settings(text, to_text(configurations()[file]))}"
+        else:
+            texts[name] = text
+    return texts
+
+
+@pytest.mark.parametrize("name", [name for name, reference in shipped().items() if ":" not in reference])
 def test_shipped_configurations_have_not_changed_silently(name, tmp_path):
-    text = to_text(configurations()[name])
-    golden = GOLDEN / f"{name}.txt"
+    text, golden = golden_texts()[name], GOLDEN / f"{name}.txt"
     if not golden.exists() or golden.read_text(encoding="utf-8") != text:
         (tmp_path / golden.name).write_text(text, encoding="utf-8")
         change = f"diff {golden} {tmp_path / golden.name}"
         pytest.fail(f"{name} has changed ({change}); if that is meant: python -m tests.test_config")
+
+
+def test_the_settings_of_an_ablation_that_differ_are_listed():
+    base = to_text(Outer(Inner(), rate=1.0))
+    assert changed_settings(base, base) == ""
+    assert changed_settings(to_text(Outer(Other(3), rate=2.0)), base) == (
+        "- part = Inner\n+ part = Other\n- part.pairs = [['RED', 0.5]]\n+ part.size = 3\n- rate = 1.0\n+ rate = 2.0\n"
+    )
 
 
 @pytest.mark.parametrize("name", sorted(shipped().keys() - {"default", "camera.native_ring"}))
@@ -101,7 +132,7 @@ def test_a_scaled_learning_rate_starts_from_the_batch_of_the_file():
 
 
 def test_every_golden_text_has_its_configuration():
-    assert {path.stem for path in GOLDEN.glob("*.txt")} == set(shipped())
+    assert {path.stem for path in GOLDEN.glob("*.txt")} == set(golden_texts())
 
 
 @pytest.mark.parametrize(
@@ -280,8 +311,8 @@ def write_golden_texts() -> None:
     """Accept every configuration as it is now: `python -m tests.test_config`."""
     for path in GOLDEN.glob("*.txt"):
         path.unlink()
-    for name, config in configurations().items():
-        (GOLDEN / f"{name}.txt").write_text(to_text(config), encoding="utf-8")
+    for name, text in golden_texts().items():
+        (GOLDEN / f"{name}.txt").write_text(text, encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -98,6 +98,10 @@ def saved(tmp_path):
         (lambda r: r["markers"][1].update(successors=[[[0, 1]]]), "marker 1: successors has shape (1, 1, 2)"),
         (lambda r: r["markers"][1].update(surveyed="July"), "marker 1: surveyed is 'July', expected a day"),
         (lambda r: r["markers"][1].update(expires=20250711), "marker 1: expires is 20250711"),
+        (
+            lambda r: r["markers"][1].update(surveyed="2025-07-11", expires="2025-07-11"),
+            "marker 1: expires is 2025-07-11, which must be after surveyed",
+        ),
         (lambda r: r["markers"][1]["global_from_marker"][0].__setitem__(0, 2.0), "1: global_from_marker is no pose"),
         (
             lambda r: r["markers"][1]["global_from_marker"][0].__setitem__(0, 1e200),

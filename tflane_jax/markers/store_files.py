@@ -129,6 +129,8 @@ def _read_marker(entry: Any, number: int, unit: float, frame: str, where: str) -
     successor = np.zeros((len(lanes), len(lanes)), bool)
     successor[tuple(edges.astype(int).T)] = True
     surveyed, expires = (_date(entry, name, where) for name in ("surveyed", "expires"))
+    if surveyed and expires and expires <= surveyed:
+        raise UserError(f"{where}: expires is {expires}, which must be after surveyed, {surveyed}")
     return StoredMarker(number, pose, lanes, successor, size, surveyed, expires)
 
 

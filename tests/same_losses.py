@@ -111,7 +111,7 @@ def main() -> int:
     """Compare, print a line for each configuration, and return 1 where one differs or fails."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("before", type=Path, help="checkout of the state before the change")
-    parser.add_argument("names", nargs="*", help="beginnings of names, as in tests/golden_configs; default all")
+    parser.add_argument("names", nargs="*", help="beginnings of names, such as tf_lane.toponet_tfm.street; default all")
     parser.add_argument("--exact", action="store_true", help="take names as they are, not as beginnings")
     parser.add_argument("--steps", type=int, default=50)
     parser.add_argument("--out", type=Path, default=ROOT / "runs" / "same_losses")

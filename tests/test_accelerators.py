@@ -18,7 +18,7 @@ from tflane_jax.training import provenance
 EIGHT = "0,1,2,3,4,5,6,7"
 
 
-def slurm(visible=EIGHT, tasks="1(x4)", place=0, host=0, **further):
+def slurm(visible: str | None = EIGHT, tasks="1(x4)", place=0, host=0, **further):
     variables = {"SLURM_LOCALID": str(place), "SLURM_NODEID": str(host), "SLURM_STEP_TASKS_PER_NODE": tasks}
     return variables | ({} if visible is None else {"CUDA_VISIBLE_DEVICES": visible}) | further
 
@@ -62,7 +62,9 @@ def joined(monkeypatch):
         asked.update(settings, place=(coordinator, processes, process), devices=local_device_ids)
 
     monkeypatch.setattr(jax.distributed, "initialize", initialize)
-    return asked
+    kept = jax.config.jax_enable_compilation_cache  # pyright: ignore[reportAttributeAccessIssue]
+    yield asked
+    jax.config.update("jax_enable_compilation_cache", kept)
 
 
 def test_a_process_that_asks_the_cluster_names_its_gpus(joined, monkeypatch):

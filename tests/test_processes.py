@@ -1,6 +1,7 @@
 """Several processes train one model: the numbers of one, one writer, agreed stops, resumes by another number."""
 
 import json
+import os
 import signal
 import socket
 import subprocess
@@ -27,9 +28,9 @@ def free_port():
 
 
 def ended(commands):
-    """Run commands side by side; return exit code, output and errors of each."""
+    """Run Python side by side with each of `commands`; return exit code, output and errors of each."""
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    began = [subprocess.Popen([sys.executable, "-m", *command], cwd=ROOT, **pipes) for command in commands]
+    began = [subprocess.Popen([sys.executable, *command], cwd=ROOT, **pipes) for command in commands]
     try:
         said = [each.communicate(timeout=200) for each in began]
         return [(each.returncode, *texts) for each, texts in zip(began, said, strict=True)]
@@ -40,7 +41,7 @@ def ended(commands):
 
 def begun(folder, starts):
     """Return the command of a process for each of `starts`."""
-    common = ["tests.training.many_processes", str(folder), str(free_port()), str(len(starts))]
+    common = ["-m", "tests.training.many_processes", str(folder), str(free_port()), str(len(starts))]
     return [[*common, str(i), start] for i, start in enumerate(starts)]
 
 
@@ -50,6 +51,32 @@ def together(folder, starts):
     for code, _, errors in found:
         assert code == 0, errors
     return [json.loads(out.splitlines()[-1]) for _, out, _ in found]
+
+
+JOINED = """
+import sys
+import jax
+from jax.experimental import multihost_utils
+from tflane_jax import processes
+from tflane_jax.training.runtime import configure_jax
+configure_jax()
+asked = []
+jax.monitoring.register_event_listener(lambda event, **_: asked.append(event))
+processes.join(f"localhost:{sys.argv[1]}", 2, int(sys.argv[2]))
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+multihost_utils.process_allgather(jax.jit(lambda x: x * 3 + 1)(2.0))
+print([event for event in asked if event.endswith(("/cache_hits", "/cache_misses"))])
+"""
+
+
+def test_joined_processes_read_and_keep_no_programs(tmp_path, monkeypatch):
+    for name in [name for name in os.environ if name.startswith("JAX_COMPILATION") or "ENABLE_COMPILATION" in name]:
+        monkeypatch.delenv(name)
+    monkeypatch.setenv("TFLANE_CACHE", str(tmp_path))
+    port = str(free_port())
+    for code, out, errors in ended([["-c", JOINED, port, str(i)] for i in range(2)]):
+        assert (code, out.splitlines()[-1:]) == (0, ["[]"]), errors
+    assert not [path for path in tmp_path.rglob("*") if path.is_file()]
 
 
 @pytest.fixture(scope="module", params=with_slow([2, 4], quick=[2]))
@@ -129,7 +156,7 @@ def test_what_one_cannot_read_before_the_first_step_ends_all_with_the_same_messa
 def test_the_command_line_trains_on_two_processes(tmp_path):
     (tmp_path / "tiny.py").write_text(TINY)
     folder, joined = tmp_path / "run", ["--coordinator", f"localhost:{free_port()}", "--processes", "2", "--process"]
-    train = ["tests.slow_start", "nothing", "train", "--config", str(tmp_path / "tiny.py:baseline"), "--out"]
+    train = ["-m", "tests.slow_start", "nothing", "train", "--config", str(tmp_path / "tiny.py:baseline"), "--out"]
     (code, out, errors), (other, nothing, _) = ended([[*train, str(folder), *joined, str(i)] for i in range(2)])
     assert (code, other) == (0, 0), errors
     assert "2 processes, 2 devices (cpu)" in errors

@@ -41,6 +41,11 @@ class AgreedError(UserError):
 def join(coordinator: str | None, processes: int | None, process: int | None) -> None:
     """Join this process to the others; call it before JAX is used.
 
+    Joined processes keep no compiled programs and read none, whatever `training.runtime.configure_jax` set: JAX writes
+    those of the first process alone. Where each host has a cache of its own, the first process would load a program
+    that the others compile. XLA divides autotuning on GPUs among the processes, and theirs would wait for results that
+    the first one never sends.
+
     With explicit arguments, a process uses all devices that it sees; in a cluster's job, those of its task
     (`accelerators.devices_of_task`). JAX_LOCAL_DEVICE_IDS overrules both.
 
@@ -71,6 +76,7 @@ def join(coordinator: str | None, processes: int | None, process: int | None) ->
         )
     except (RuntimeError, ValueError) as error:
         raise UserError(f"the processes of this training cannot be joined: {str(error).splitlines()[0]}") from error
+    jax.config.update("jax_enable_compilation_cache", False)
 
 
 def count() -> int:

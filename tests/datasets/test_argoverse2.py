@@ -142,7 +142,7 @@ def test_logs_are_read_when_they_are_needed_and_few_are_kept(folder, monkeypatch
         return made
 
     monkeypatch.setattr(argoverse2, "load_log", counted)
-    monkeypatch.setattr(log_frames, "_KEPT", 1)
+    monkeypatch.setattr(log_frames, "KEPT_LOGS", 1)
     dataset = Argoverse2Dataset(Argoverse2Config(folder.parent))
     assert (len(dataset), dataset.info(3).scene, dataset.info(3).area, read) == (4, "log-b", "PIT", [])
     alone = load_log(folder)

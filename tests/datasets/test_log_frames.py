@@ -68,7 +68,7 @@ def test_recorded_logs_are_read_when_an_example_needs_them(folder, read):
 
 
 def test_scene_files_are_read_when_an_example_needs_them_and_few_are_kept(folder, read, monkeypatch):
-    monkeypatch.setattr(log_frames, "_KEPT", 1)
+    monkeypatch.setattr(log_frames, "KEPT_LOGS", 1)
     dataset = SceneFileDataset(SceneFileConfig(folder / "scenes"))
     assert [dataset.info(index).timestamp_ns for index in range(len(dataset))] == [0, 500_000_000, 10**9] * 2
     assert read == []

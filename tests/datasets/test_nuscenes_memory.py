@@ -16,7 +16,7 @@ SIZES = ExampleConfig(lanes=6, segments=6, areas=6, tracks=4, elements=2)
 
 
 def test_only_the_logs_last_asked_for_are_kept(tmp_path, monkeypatch):
-    monkeypatch.setattr(nuscenes, "_LOGS", 1)
+    monkeypatch.setattr(nuscenes, "KEPT_LOGS", 1)
     dataset = NuScenesDataset(NuScenesConfig(write_nuscenes(tmp_path), example=SIZES))
     name = dataset.info(0).scene
     first = dataset.log(name)

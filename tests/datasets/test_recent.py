@@ -2,6 +2,7 @@
 
 import pickle
 import threading
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
@@ -42,6 +43,63 @@ def test_threads_share_one_value():
     for thread in threads:
         thread.join()
     assert sorted(made) == [0, 1, 2, 3]
+
+
+@pytest.fixture
+def waiting():
+    """A `Recent` whose value of "slow" is made only when the event is set, by a thread that has begun it."""
+    begun, go_on, made = threading.Event(), threading.Event(), []
+
+    def make(key):
+        made.append(key)
+        if key == "slow":
+            begun.set()
+            assert go_on.wait(20)
+        return [key]
+
+    recent = Recent(make, 8)
+    with ThreadPoolExecutor(3) as pool:
+        slow = pool.submit(recent, "slow")
+        assert begun.wait(20)
+        yield recent, pool, slow, go_on, made
+        go_on.set()
+
+
+def test_while_one_is_made_others_are_made_and_kept_ones_are_returned(waiting):
+    recent, pool, slow, *_ = waiting
+    for _ in range(2):  # made, then kept
+        assert pool.submit(recent, "other").result(20) == ["other"]
+    assert not slow.done()
+
+
+def test_who_asks_for_what_is_being_made_waits_for_it(waiting):
+    recent, pool, slow, go_on, made = waiting
+    second = pool.submit(recent, "slow")
+    with pytest.raises(TimeoutError):
+        second.result(0.1)
+    go_on.set()
+    assert second.result(20) is slow.result(20)
+    assert made == ["slow"]
+    assert not recent._making._used
+
+
+def test_after_an_error_the_next_one_that_waits_tries_again():
+    begun, go_on, tries = threading.Event(), threading.Event(), iter([1, 0, 0])
+
+    def make(key):
+        begun.set()
+        assert go_on.wait(20)
+        return 1 // (1 - next(tries))
+
+    recent = Recent(make, 8)
+    with ThreadPoolExecutor(3) as pool:
+        first = pool.submit(recent, "key")
+        assert begun.wait(20)
+        later = [pool.submit(recent, "key") for _ in range(2)]
+        go_on.set()
+        assert isinstance(first.exception(20), ZeroDivisionError)
+        assert [each.result(20) for each in later] == [1, 1]
+    assert list(tries) == [0]
 
 
 def test_a_pickled_copy_is_empty():

@@ -9,8 +9,11 @@ from tflane_jax.datasets.base import FrameInfo
 from tflane_jax.datasets.recent import Recent
 from tflane_jax.scene.logs import KeyFrame, Log
 
-# Logs in memory: one takes 2.4 MB with its prepared map, and a sixth of a second to read.
-_KEPT = 256
+KEPT_LOGS = 1024
+"""Logs in memory, at most, of a split and process: 2.5 GB. One takes 2.4 MB with its prepared map, and a sixth of a
+second to read. Training asks for frames in random order, so that every log of a split is soon asked for again: with 256
+of nuScenes' 700, 65 % of all frames read a log anew. Both nuScenes and Argoverse 2 have 700 for training, 150 for
+validation."""
 
 
 @dataclass(frozen=True)
@@ -24,7 +27,7 @@ class LogOutline:
 
 
 class LogFrames:
-    """Key frames by number, log after log. The last `_KEPT` logs are kept.
+    """Key frames by number, log after log. The last `KEPT_LOGS` logs are kept.
 
     Args:
         outlines: of the logs.
@@ -34,7 +37,7 @@ class LogFrames:
     def __init__(self, outlines: Sequence[LogOutline], read: Callable[[int], Log]):
         self._outlines = tuple(outlines)
         self._places = [(row, i) for row, log in enumerate(outlines) for i in range(len(log.keyframes))]
-        self._log: Recent[int, Log] = Recent(read, _KEPT)
+        self._log: Recent[int, Log] = Recent(read, KEPT_LOGS)
 
     def __len__(self) -> int:
         return len(self._places)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import datetime
-import threading
 import warnings
 import weakref
 
@@ -12,6 +11,7 @@ from jaxtyping import Float
 
 from tflane_jax.datasets.base import TruncationWarning
 from tflane_jax.datasets.prepared_map import prepare_map
+from tflane_jax.datasets.recent import KeyLocks, made_once
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import PerceptionRange, relative_pose
 from tflane_jax.markers.detection import DetectedMarkers
@@ -28,7 +28,7 @@ from tflane_jax.world.roads.markers import PlacementConfig
 # Detections in images by log, track frame and settings: key frames are also the earlier moment of later ones.
 _DETECTED: dict[tuple[int, int, CameraRigConfig, PixelConfig], DetectedMarkers] = {}
 _REMEMBERED: dict[tuple[int, float, bool], tuple[PlacedMarkers, MarkerStore]] = {}
-_LOCK = threading.Lock()
+_REMEMBERING = KeyLocks()
 
 
 def markers_of(log: Log) -> PlacedMarkers:
@@ -66,11 +66,12 @@ def store_of_log(
 def _remembered(log: Log, radius: float, bike_lanes: bool) -> tuple[PlacedMarkers, MarkerStore]:
     """Return the markers of a log and their store, made once for all its frames. Threads may call it."""
     key = (id(log), radius, bike_lanes)
-    with _LOCK:
-        if key not in _REMEMBERED:
-            _REMEMBERED[key] = markers_of(log), store_of_log(log, radius=radius, bike_lanes=bike_lanes)
-            weakref.finalize(log, _REMEMBERED.pop, key, None)
-        return _REMEMBERED[key]
+
+    def make() -> tuple[PlacedMarkers, MarkerStore]:
+        weakref.finalize(log, _REMEMBERED.pop, key, None)
+        return markers_of(log), store_of_log(log, radius=radius, bike_lanes=bike_lanes)
+
+    return made_once(_REMEMBERED, key, _REMEMBERING, make)
 
 
 def _detected(

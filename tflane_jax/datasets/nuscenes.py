@@ -8,7 +8,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
@@ -21,6 +20,7 @@ from jaxtyping import Float
 from tflane_jax.datasets.base import ExampleConfig, FrameInfo, Split
 from tflane_jax.datasets.data_source import Choice, DataSource
 from tflane_jax.datasets.examples import make_example
+from tflane_jax.datasets.log_frames import KEPT_LOGS
 from tflane_jax.datasets.nuscenes_cameras import (
     CAMERAS,
     CameraPoses,
@@ -59,8 +59,8 @@ from tflane_jax.scene.logs import Log
 
 # Metres of map beyond the corners of the perception range, so that chains of lanes are merged as on the whole map.
 _BEYOND = 60.0
-# Logs that are kept, some 2.4 MB each; the whole data set has 850.
-_LOGS = 256
+# Cities whose maps are kept: all of them.
+_CITIES = 4
 
 
 @dataclass(frozen=True)
@@ -123,17 +123,11 @@ class NuScenesDataset:
         )
         self.scenes = {name: scenes[name] for name in names}
         self._places = [(name, i) for name in names for i in range(len(self.tables.samples(scenes[name])))]
-        self._frames: dict[str, SceneFrames] = {}
-        self._maps: dict[str, MapExpansion] = {}
-        self._lock = threading.Lock()
-        self.log = Recent(self._log, _LOGS)
+        self._map = Recent(self._read_map, _CITIES)
+        self.frames = Recent(self._read_frames, len(names))
+        """Scene name -> moments and poses of the scene."""
+        self.log = Recent(self._log, KEPT_LOGS)
         """Scene name -> the scene as a log with the part of the city's map around it."""
-
-    def __getstate__(self):
-        return self.__dict__ | {"_lock": None, "_frames": {}, "_maps": {}}
-
-    def __setstate__(self, state):
-        self.__dict__.update(state | {"_lock": threading.Lock()})
 
     def __len__(self) -> int:
         return len(self._places)
@@ -199,19 +193,16 @@ class NuScenesDataset:
     def _log(self, name: str) -> Log:
         frames = self.frames(name)
         location, scene = self.tables.location(self.scenes[name]), self.scenes[name]
-        if location not in self._maps:  # `Recent` makes one log at a time
-            self._maps[location] = read_expansion(self.tables.map_path(location))
-        area = self._maps[location].around(frames.global_from_frame[:, :2, 3], _reach(self.config.example))
+        area = self._map(location).around(frames.global_from_frame[:, :2, 3], _reach(self.config.example))
         log = scene_log(self.tables, scene, frames, area, least_visibility=self.config.least_visibility)
         prepare_map(log.map, bike_lanes=self.config.example.bike_lanes == "include")
         return log
 
-    def frames(self, name: str) -> SceneFrames:
-        """Return moments and poses of a scene."""
-        with self._lock:
-            if name not in self._frames:
-                self._frames[name] = scene_frames(self.tables, self.scenes[name], self.config.frame)
-            return self._frames[name]
+    def _read_map(self, location: str) -> MapExpansion:
+        return read_expansion(self.tables.map_path(location))
+
+    def _read_frames(self, name: str) -> SceneFrames:
+        return scene_frames(self.tables, self.scenes[name], self.config.frame)
 
     @cached_property
     def _fits(self) -> tuple[ImageFit | None, ...]:

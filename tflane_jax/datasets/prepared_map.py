@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 import weakref
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,6 +12,7 @@ from tflane_jax.datasets.chains import merge_chains
 from tflane_jax.datasets.lane_dividers import lane_dividers
 from tflane_jax.datasets.map_geometry import MapGeometry
 from tflane_jax.datasets.packed_lines import PackedLines
+from tflane_jax.datasets.recent import KeyLocks, made_once
 from tflane_jax.scene.logs import LaneSegment, VectorMap
 from tflane_jax.world.bev.map_samples import MapSamples, sample_map
 
@@ -86,7 +86,7 @@ class PreparedMap:
 
 
 _PREPARED: dict[tuple[int, bool], PreparedMap] = {}
-_LOCK = threading.Lock()
+_PREPARING = KeyLocks()
 
 
 def prepare_map(vector_map: VectorMap, *, bike_lanes: bool) -> PreparedMap:
@@ -97,11 +97,12 @@ def prepare_map(vector_map: VectorMap, *, bike_lanes: bool) -> PreparedMap:
         bike_lanes: whether to keep bicycle lanes. Whether the official ground truth does is unknown; MapTRv2 does.
     """
     key = (id(vector_map), bike_lanes)
-    with _LOCK:
-        if key not in _PREPARED:
-            _PREPARED[key] = _prepare(vector_map, bike_lanes)
-            weakref.finalize(vector_map, _PREPARED.pop, key)
-        return _PREPARED[key]
+
+    def make() -> PreparedMap:
+        weakref.finalize(vector_map, _PREPARED.pop, key, None)
+        return _prepare(vector_map, bike_lanes)
+
+    return made_once(_PREPARED, key, _PREPARING, make)
 
 
 def _prepare(vector_map: VectorMap, bike_lanes: bool) -> PreparedMap:

@@ -1,14 +1,49 @@
-"""Values that are made when they are asked for, of which the last ones are kept."""
+"""Values that are made when they are asked for, once, whichever thread asks, and kept.
+
+Only threads that ask for the same value wait while it is made.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Iterator, MutableMapping
 from typing import Generic, TypeVar
 
 K = TypeVar("K", bound=Hashable)
 V = TypeVar("V")
+
+
+class KeyLocks:
+    """A lock for each key. Calling it gives a context in which one thread at a time works for the key."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._used: dict[Hashable, tuple[threading.Lock, int]] = {}  # and by how many threads
+
+    @contextlib.contextmanager
+    def __call__(self, key: Hashable) -> Iterator[None]:
+        with self._lock:
+            own, users = self._used.get(key, (threading.Lock(), 0))
+            self._used[key] = own, users + 1
+        try:
+            with own:
+                yield
+        finally:
+            with self._lock:
+                _, users = self._used.pop(key)
+                if users > 1:
+                    self._used[key] = own, users - 1
+
+
+def made_once(kept: MutableMapping[K, V], key: K, making: KeyLocks, make: Callable[[], V]) -> V:
+    """Return the kept value of a key (never None), or make and keep it; an error of `make` leaves nothing behind."""
+    if (found := kept.get(key)) is None:
+        with making(key):
+            if (found := kept.get(key)) is None:
+                found = kept[key] = make()
+    return found
 
 
 class Recent(Generic[K, V]):
@@ -17,7 +52,8 @@ class Recent(Generic[K, V]):
     A pickled copy keeps nothing at first, so that a worker process gets no values that it may never need.
 
     Args:
-        make: key -> value. Of the keys that are asked for at once, one is made after the other.
+        make: key -> value. Threads that ask for one key at once wait for the first of them; after an error, the next
+            one tries again. Other keys are made meanwhile.
         most: number of values that are kept; of more, those asked for longest ago are dropped.
     """
 
@@ -25,15 +61,26 @@ class Recent(Generic[K, V]):
         self._make, self._most = make, most
         self._kept: OrderedDict[K, V] = OrderedDict()
         self._lock = threading.Lock()
+        self._making = KeyLocks()
 
     def __reduce__(self):
         return Recent, (self._make, self._most)
 
     def __call__(self, key: K) -> V:
+        with contextlib.suppress(KeyError):
+            return self._asked_for(key)
+        with self._making(key):
+            with contextlib.suppress(KeyError):
+                return self._asked_for(key)
+            value = self._make(key)
+            with self._lock:
+                self._kept[key] = value
+                if len(self._kept) > self._most:
+                    self._kept.popitem(last=False)
+            return value
+
+    def _asked_for(self, key: K) -> V:
+        """Return a kept value, the last to be dropped from now on; raises KeyError for one that is not kept."""
         with self._lock:
-            if key not in self._kept:
-                self._kept[key] = self._make(key)
             self._kept.move_to_end(key)
-            if len(self._kept) > self._most:
-                self._kept.popitem(last=False)
             return self._kept[key]

@@ -16,6 +16,7 @@ from tflane_jax.geometry.polylines import (
     arc_length,
     clip_to_range,
     line_distances,
+    line_lengths,
     nearest_lines,
     nearest_on,
     pad_lines,
@@ -125,6 +126,13 @@ def test_the_nearest_place_on_a_line_is_that_of_shapely(seed, points):
     assert distance == pytest.approx(expected.distance(Point(place)))
     there = line[segment] + fraction * (line[min(segment + 1, points - 1)] - line[segment])
     assert np.linalg.norm(there[:2] - place) == pytest.approx(distance)
+
+
+@pytest.mark.parametrize("shape", [(3,), (2, 4), (0, 3), (2, 1)])
+def test_lengths_of_lines_are_in_the_ground_plane(shape):
+    lines = np.random.default_rng(0).uniform(-9, 9, (*shape, 3))
+    expected = [arc_length(line)[-1] for line in lines.reshape(-1, *lines.shape[-2:])]
+    np.testing.assert_allclose(line_lengths(lines), np.reshape(expected, shape[:-1]))
 
 
 @QUICK

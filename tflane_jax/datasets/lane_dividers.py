@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from tflane_jax.datasets.map_geometry import join_ends
-from tflane_jax.geometry import line_distances, resample_lines
+from tflane_jax.geometry import line_distances, line_lengths, resample_lines
 from tflane_jax.scene.logs import LaneSegment
 
 # Two boundaries are one line if all points of either lie this near to the other, metres.
@@ -30,7 +30,7 @@ def lane_dividers(lanes: Sequence[LaneSegment]) -> list[np.ndarray]:
     owner = np.array([number for number, _ in sides])
     lines = [line for _, line in sides]
     dense = resample_lines(lines, _POINTS)
-    length = np.linalg.norm(np.diff(dense[..., :2], axis=1), axis=-1).sum(-1)
+    length = line_lengths(dense)
     kept: list[int] = []
     for i in np.argsort(-length, kind="stable").tolist():
         near = _touching(dense, i)

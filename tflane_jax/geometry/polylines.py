@@ -19,6 +19,11 @@ def arc_length(points: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " n"]:
     return np.concatenate([[0.0], np.cumsum(steps)])
 
 
+def line_lengths(lines: Float[np.ndarray, "*b n d"]) -> Float[np.ndarray, "*b"]:
+    """Return the ground-plane length of every line, metres."""
+    return np.linalg.norm(np.diff(lines[..., :2], axis=-2), axis=-1).sum(-1)
+
+
 def resample(points: Float[np.ndarray, "n d"], count: int) -> Float[np.ndarray, "count d"]:
     """Return `count` points equally spaced in ground-plane arc length, both ends included.
 

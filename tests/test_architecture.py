@@ -29,7 +29,6 @@ FLOORS = (
     "world.simulate",
     "world.presets",
     "markers",
-    "datasets",
     "priors",
     "layers",
     "models",
@@ -37,6 +36,7 @@ FLOORS = (
     "losses",
     "metrics",
     "scoring",
+    "datasets",
     "evaluation",
     "plots",
     "training",
@@ -53,6 +53,8 @@ FLOORS = (
     "commands",
     "cli",
 )
+# What learns and measures, and what reads data, know nothing of each other; `evaluation` joins them.
+LEARNING = {"priors", "layers", "models", "matching", "losses", "metrics", "scoring"}
 FLOOR = {room: height for height, rooms in enumerate(FLOORS) for room in rooms.split()}
 
 LONGEST_FILE = 350
@@ -121,6 +123,12 @@ def test_every_package_has_its_floor():
 def test_imports_go_downward_only():
     wrong = {pair: paths for pair, paths in room_imports().items() if FLOOR[pair[1]] >= FLOOR[pair[0]]}
     assert wrong == {}
+
+
+def test_datasets_and_the_learning_core_do_not_import_each_other():
+    pairs = room_imports()
+    assert {source for source, target in pairs if target == "datasets"} & LEARNING == set()
+    assert {target for source, target in pairs if source == "datasets"} & LEARNING == set()
 
 
 def test_upward_imports_would_be_found():

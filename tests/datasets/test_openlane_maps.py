@@ -10,12 +10,12 @@ from tests.datasets.small_logs import log, tracks
 from tests.world.small_map import crossroads
 from tflane_jax.datasets.base import ExampleConfig
 from tflane_jax.datasets.examples import make_example
-from tflane_jax.datasets.identities import Identities, line_distances
+from tflane_jax.datasets.identities import Identities
 from tflane_jax.datasets.openlane_export import centerline_annotation, segment_annotation
 from tflane_jax.datasets.openlane_maps import joined, read_segment, same_lines, segment_files
 from tflane_jax.datasets.road_maps import find_maps
 from tflane_jax.errors import UserError
-from tflane_jax.geometry import yaw_pose
+from tflane_jax.geometry import line_distances, yaw_pose
 from tflane_jax.geometry.polylines import resample_lines
 from tflane_jax.scene import LineType
 from tflane_jax.world.roads.map_networks import prepare_roads
@@ -49,8 +49,8 @@ def root(tmp_path_factory):
 def true_lane(line):
     """Return the id of the only lane of the crossroads on which a line lies, and how far it lies off."""
     lanes = list(TRUTH.segments.values())
-    distance, place = line_distances(line[None], resample_lines([lane.centerline for lane in lanes], 101))
-    off = np.where(place[0, :, -1] > place[0, :, 0], distance[0].max(-1), np.inf)
+    distance, place = line_distances(line, resample_lines([lane.centerline for lane in lanes], 101))
+    off = np.where(place[:, -1] > place[:, 0], distance.max(-1), np.inf)
     return lanes[off.argmin()].id, off.min()
 
 
@@ -76,7 +76,7 @@ def test_the_lanes_of_all_frames_are_those_of_the_map(root, flavour):
     assert bool(found.map.road_boundaries) == bool(flavour)
     kerbs = resample_lines(list(TRUTH.road_boundaries), 201)
     for line in found.map.road_boundaries:
-        assert line_distances(line[None], kerbs)[0][0].min(0).max() < 0.4
+        assert line_distances(line, kerbs)[0].min(0).max() < 0.4
     np.testing.assert_allclose(found.places, np.stack(EAST_TO_WEST)[:, :2, 3])
 
 

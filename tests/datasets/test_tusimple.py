@@ -15,12 +15,12 @@ from tflane_jax.datasets import sources
 from tflane_jax.datasets.augmentation import AugmentationConfig
 from tflane_jax.datasets.base import TruncationWarning
 from tflane_jax.datasets.batches import batches
-from tflane_jax.datasets.lane_rows import ROWS, lane_lines, row_lanes
+from tflane_jax.datasets.lane_rows import lane_lines, row_lanes
 from tflane_jax.datasets.streaming import Streamed, StreamingConfig
 from tflane_jax.datasets.tusimple import TuSimpleConfig, TuSimpleData, TuSimpleDataset, load_road_images
 from tflane_jax.errors import UserError
 from tflane_jax.evaluation.results import EvaluationConfig
-from tflane_jax.files.tusimple import RowLanes
+from tflane_jax.files.tusimple import ROWS, RowLanes
 from tflane_jax.metrics.tusimple import TuSimpleMetrics, score_image
 from tflane_jax.scene import CurvePrediction, Prediction
 from tflane_jax.tasks.lane_shape import LaneShapeTask, found_lanes

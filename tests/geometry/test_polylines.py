@@ -15,6 +15,8 @@ from tflane_jax.geometry import PerceptionRange, pose_matrix, transform_points
 from tflane_jax.geometry.polylines import (
     arc_length,
     clip_to_range,
+    line_distances,
+    line_lengths,
     nearest_lines,
     nearest_on,
     pad_lines,
@@ -124,6 +126,36 @@ def test_the_nearest_place_on_a_line_is_that_of_shapely(seed, points):
     assert distance == pytest.approx(expected.distance(Point(place)))
     there = line[segment] + fraction * (line[min(segment + 1, points - 1)] - line[segment])
     assert np.linalg.norm(there[:2] - place) == pytest.approx(distance)
+
+
+@pytest.mark.parametrize("shape", [(3,), (2, 4), (0, 3), (2, 1)])
+def test_lengths_of_lines_are_in_the_ground_plane(shape):
+    lines = np.random.default_rng(0).uniform(-9, 9, (*shape, 3))
+    expected = [arc_length(line)[-1] for line in lines.reshape(-1, *lines.shape[-2:])]
+    np.testing.assert_allclose(line_lengths(lines), np.reshape(expected, shape[:-1]))
+
+
+@QUICK
+@given(seed=st.integers(0, 10**6), points=st.integers(1, 9), others=st.integers(2, 9))
+def test_distances_to_lines_are_those_of_shapely(seed, points, others):
+    rng = np.random.default_rng(seed)
+    lines, seconds = rng.uniform(-9, 9, (2, points, 3)), rng.uniform(-9, 9, (3, others, 3))
+    seconds[0, 1] = seconds[0, 0]  # a piece without length
+    distance, place = line_distances(lines[:, None], seconds)
+    assert distance.shape == place.shape == (2, 3, points)
+    for i, j, k in np.ndindex(distance.shape):
+        assert distance[i, j, k] == pytest.approx(LineString(seconds[j, :, :2]).distance(Point(lines[i, k, :2])))
+        there = [np.interp(place[i, j, k], np.arange(others), seconds[j, :, axis]) for axis in (0, 1)]
+        assert np.linalg.norm(there - lines[i, k, :2]) == pytest.approx(distance[i, j, k])
+    paired = line_distances(lines, seconds[:2])
+    for pair, alone in zip(paired, (distance, place), strict=True):
+        np.testing.assert_array_equal(pair, alone[[0, 1], [0, 1]])
+
+
+@pytest.mark.parametrize(("lines", "others"), [(0, 3), (3, 0), (0, 0), (1, 1)])
+def test_distances_of_few_lines(lines, others):
+    found = line_distances(np.zeros((lines, 1, 4, 3)), np.zeros((others, 2, 3)))
+    assert [array.shape for array in found] == [(lines, others, 4)] * 2
 
 
 def test_the_nearest_lines_are_those_that_pass_near():

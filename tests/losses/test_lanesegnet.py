@@ -13,7 +13,6 @@ from tests.golden import case_id, golden_modules, load_module_case, numbered
 from tests.golden_compare import compare
 from tests.models.cases import SEGMENTS, make_bucket_example, make_segment_example
 from tflane_jax.convert.toponet import RELATIONSHIP
-from tflane_jax.datasets.segment_targets import SegmentTargets
 from tflane_jax.layers.graph import RelationshipHead
 from tflane_jax.losses.costs import dice_cost, focal_cost, mask_cost
 from tflane_jax.losses.lanesegnet import (
@@ -26,7 +25,7 @@ from tflane_jax.losses.lanesegnet import (
 from tflane_jax.losses.traffic_elements import ElementLossConfig
 from tflane_jax.matching import Assignment, match
 from tflane_jax.models.auxiliary import AuxiliaryOutputs
-from tflane_jax.models.segment_truth import CROSSING, LANE
+from tflane_jax.models.segment_truth import CROSSING, LANE, SegmentTargets
 from tflane_jax.scene import ElementPrediction, Prediction, SegmentPrediction, stack_examples
 
 

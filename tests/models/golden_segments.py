@@ -4,8 +4,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from tests.golden import implemented, numbered, options
-from tflane_jax.datasets.segment_targets import SegmentTargets
 from tflane_jax.models.lane_segments import SegmentDecoderConfig
+from tflane_jax.models.segment_truth import SegmentTargets
 from tflane_jax.scene import stack_examples
 
 

@@ -12,31 +12,12 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Bool, Float
 
-from tflane_jax.geometry import invert_pose, transform_points
+from tflane_jax.geometry import invert_pose, line_distances, transform_points
 from tflane_jax.scene import Example
 
 # Metres; items farther apart are different. Resampled polylines of one curve differ by less.
 _SAME = 0.75
 _FAR = 1e6
-
-
-def line_distances(
-    lines: Float[np.ndarray, "n p 3"], others: Float[np.ndarray, "m q 3"]
-) -> tuple[Float[np.ndarray, "n m p"], Float[np.ndarray, "n m p"]]:
-    """Return the ground-plane distance from every vertex to every other line, and the nearest place on that line.
-
-    Distances are in metres. A place is a vertex number with a fraction, from 0 at the first vertex to q - 1 at the
-    last. Lines need q >= 2 vertices.
-    """
-    points, start, step = lines[:, None, :, None, :2], others[:, :-1, :2], np.diff(others[..., :2], axis=1)
-    square = (step**2).sum(-1)
-    start, step = start[None, :, None], step[None, :, None]
-    fraction = ((points - start) * step).sum(-1) / np.where(square > 0.0, square, 1.0)[None, :, None]
-    fraction = np.clip(fraction, 0.0, 1.0)
-    distance = np.linalg.norm(start + fraction[..., None] * step - points, axis=-1)
-    nearest = distance.argmin(-1)[..., None]
-    place = nearest + np.take_along_axis(fraction, nearest, -1)
-    return np.take_along_axis(distance, nearest, -1)[..., 0], place[..., 0]
 
 
 @dataclass
@@ -108,8 +89,8 @@ def _separation(now: _Kind, before: _Kind) -> Float[np.ndarray, "n m"]:
     The smaller one, because a line may be cut shorter. A small part of the other direction decides between lines that
     overlap in part.
     """
-    there = line_distances(now.lines, before.lines)[0].mean(-1)
-    back = line_distances(before.lines, now.lines)[0].mean(-1).T
+    there = line_distances(now.lines[:, None], before.lines)[0].mean(-1)
+    back = line_distances(before.lines[:, None], now.lines)[0].mean(-1).T
     known = np.abs(now.lines).max((1, 2)) > 0.0  # not an element whose position is not known
     apart = np.minimum(there, back) + 1e-3 * np.maximum(there, back)
     return np.where(known[:, None] & (now.label[:, None] == before.label), apart, _FAR)

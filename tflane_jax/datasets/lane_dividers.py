@@ -12,9 +12,8 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from tflane_jax.datasets.identities import line_distances
 from tflane_jax.datasets.map_geometry import join_ends
-from tflane_jax.geometry.polylines import resample_lines
+from tflane_jax.geometry import line_distances, line_lengths, resample_lines
 from tflane_jax.scene.logs import LaneSegment
 
 # Two boundaries are one line if all points of either lie this near to the other, metres.
@@ -31,7 +30,7 @@ def lane_dividers(lanes: Sequence[LaneSegment]) -> list[np.ndarray]:
     owner = np.array([number for number, _ in sides])
     lines = [line for _, line in sides]
     dense = resample_lines(lines, _POINTS)
-    length = np.linalg.norm(np.diff(dense[..., :2], axis=1), axis=-1).sum(-1)
+    length = line_lengths(dense)
     kept: list[int] = []
     for i in np.argsort(-length, kind="stable").tolist():
         near = _touching(dense, i)
@@ -56,7 +55,7 @@ def _lies_on(
     """Return whether a line lies on each of the others, and whether each of these lies on it."""
     if not len(others):
         return np.zeros(0, bool), np.zeros(0, bool)
-    line = lines[number : number + 1]
+    line = lines[number]
     there, _ = line_distances(line, lines[others])
     back, _ = line_distances(lines[others], line)
-    return there[0].max(-1) < _SAME_LINE, back[:, 0].max(-1) < _SAME_LINE
+    return there.max(-1) < _SAME_LINE, back.max(-1) < _SAME_LINE

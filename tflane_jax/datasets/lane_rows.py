@@ -14,12 +14,10 @@ from jaxtyping import Bool, Float
 
 from tflane_jax.datasets.base import TruncationWarning
 from tflane_jax.datasets.streaming import Streamed
-from tflane_jax.files.tusimple import NO_POINT, RowLanes
+from tflane_jax.files.tusimple import NO_POINT, ROWS, SIZE, RowLanes
 from tflane_jax.scene import LaneLines, RoadImage
 
-ROWS = np.arange(160.0, 720.0, 10.0)
-"""(56,) rows of the points of a line, pixels of an image of height `ROWS_HEIGHT`."""
-ROWS_HEIGHT = 720
+_HEIGHT, _WIDTH = SIZE
 
 
 @dataclass(frozen=True)
@@ -48,7 +46,7 @@ def lane_lines(truth: RowLanes, height: int, width: int, *, capacity: int = 8) -
         capacity: number of lines that the result has room for.
     """
     assert truth.rows is not None, "labels have rows"
-    x, valid = _at_rows(truth, ROWS * (height / ROWS_HEIGHT))
+    x, valid = _at_rows(truth, ROWS * (height / _HEIGHT))
     kept = np.flatnonzero(valid.any(1))
     if len(kept) > capacity:
         message = f"an image has {len(kept)} lines and room for {capacity}: raise `capacity`"
@@ -58,14 +56,14 @@ def lane_lines(truth: RowLanes, height: int, width: int, *, capacity: int = 8) -
     kept = kept[np.argsort(first, kind="stable")]
     lines = LaneLines.empty(capacity, len(ROWS))
     n = len(kept)
-    lines.points[..., 1] = ROWS / ROWS_HEIGHT
+    lines.points[..., 1] = ROWS / _HEIGHT
     lines.points[:n, :, 0] = np.where(valid[kept], x[kept] / width, 0.0)
     lines.point_valid[:n] = valid[kept]
     lines.valid[:n] = True
     return lines
 
 
-def row_lanes(lines: LaneLines, height: float = ROWS_HEIGHT, width: float = 1280.0) -> RowLanes:
+def row_lanes(lines: LaneLines, height: float = _HEIGHT, width: float = _WIDTH) -> RowLanes:
     """Return lines whose point p is at `ROWS[p]` as TuSimple's metric reads them, in pixels of an image of that size.
 
     Points left of the image are absent, because the metric reads a negative x as "no point". Raises ValueError for a
@@ -74,10 +72,10 @@ def row_lanes(lines: LaneLines, height: float = ROWS_HEIGHT, width: float = 1280
     points = np.asarray(lines.points, np.float64)[np.asarray(lines.valid)]
     valid = np.asarray(lines.point_valid)[np.asarray(lines.valid)]
     u, v = points[..., 0], points[..., 1]
-    if valid.shape[1] != len(ROWS) or (valid & ~(np.abs(v * ROWS_HEIGHT - ROWS) < 0.01)).any():
+    if valid.shape[1] != len(ROWS) or (valid & ~(np.abs(v * _HEIGHT - ROWS) < 0.01)).any():
         raise ValueError("the lines' points do not stand at TuSimple's rows: give lines that were not augmented")
     x = np.where(valid & (u >= 0.0), u * width, NO_POINT)
-    return RowLanes(x, ROWS * (height / ROWS_HEIGHT), size=(height, width))
+    return RowLanes(x, ROWS * (height / _HEIGHT), size=(height, width))
 
 
 def _at_rows(

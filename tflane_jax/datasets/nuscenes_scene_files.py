@@ -31,7 +31,7 @@ from tflane_jax.datasets.plausible import LONGEST, SHORTEST, check_distance, che
 from tflane_jax.errors import UserError
 from tflane_jax.files.fields import member, numbers, shown
 from tflane_jax.files.npz import read_npz
-from tflane_jax.geometry import invert_pose, transform_points, wrap_angle, yaw_pose
+from tflane_jax.geometry import invert_pose, line_distances, transform_points, wrap_angle, yaw_pose
 from tflane_jax.scene import LineType, RoadUser
 from tflane_jax.scene.logs import KeyFrame, LaneSegment, Log, Tracks, VectorMap
 
@@ -229,17 +229,9 @@ def _marking(
         return LineType.NONE
     near = {kind: np.zeros(len(side), bool) for kind in (LineType.SOLID, LineType.DASHED)}
     for line, kind in dividers:
-        near[kind] |= _distance(side, line) < _ON_DIVIDER
+        near[kind] |= line_distances(side, line)[0] < _ON_DIVIDER
     most = max(near, key=lambda kind: near[kind].mean())
     return most if near[most].mean() > 0.5 else LineType.NONE
-
-
-def _distance(points: Float[np.ndarray, "n 2"], line: Float[np.ndarray, "m 2"]) -> Float[np.ndarray, " n"]:
-    """Return the distance of points to a polyline."""
-    step = np.diff(line, axis=0)
-    square = np.maximum((step**2).sum(-1), 1e-12)
-    along = np.clip(((points[:, None] - line[:-1]) * step).sum(-1) / square, 0.0, 1.0)
-    return np.linalg.norm(points[:, None] - line[:-1] - along[..., None] * step, axis=-1).min(-1)
 
 
 def find_scene_files(root: Path) -> list[Path]:

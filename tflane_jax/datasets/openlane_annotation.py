@@ -20,6 +20,7 @@ from tflane_jax.files.openlane import (
     read_lines,
     read_matrix,
 )
+from tflane_jax.geometry import line_lengths
 
 # Metres of mean width below zero: boundaries that the crop has shortened may cross, swapped ones are 3 m the wrong way.
 _SWAPPED = 0.5
@@ -109,7 +110,7 @@ def _check_lanes(
     if (own := np.flatnonzero(np.diagonal(successor))).size:
         raise UserError(f"{where}: {names.lane_lane}: {names.lanes}[{own[0]}] is its own successor: restore the file")
     for i, (left, right) in enumerate(zip(*(side or [] for side in sides), strict=True)):
-        length = sum(float(np.linalg.norm(np.diff(line[:, :2], axis=0), axis=1).sum()) for line in (left, right)) / 2
+        length = sum(float(line_lengths(line)) for line in (left, right)) / 2
         if left_of(left, right) < -_SWAPPED * length:
             raise UserError(
                 f"{where}: {names.lanes}[{i}]: the left boundary is to the right of the right one, in driving direction"

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from tflane_jax.datasets.base import Dataset, FrameInfo, Split
-from tflane_jax.datasets.identities import Identities, line_distances
+from tflane_jax.datasets.identities import Identities
 from tflane_jax.datasets.openlane_frames import SUBSETS, SubsetName, info_path
 from tflane_jax.datasets.openlane_sd_map import FILE as SD_MAP_FILE
 from tflane_jax.errors import UserError
@@ -25,7 +25,8 @@ from tflane_jax.files.openlane import CENTERLINE, DENSE_POINTS, SEGMENT, FrameKe
 from tflane_jax.geometry import invert_pose
 from tflane_jax.geometry.polylines import resample
 from tflane_jax.progress import progress_bar
-from tflane_jax.scene import CameraViews, Example, LaneGraph, TrafficElements
+from tflane_jax.scene import CameraViews, Example, TrafficElements
+from tflane_jax.scene.lane_segments import segments_on_lanes
 
 ImageFormat = Literal["jpg", "png"]
 VERSION = "tflane_jax 1"
@@ -33,8 +34,6 @@ _JPEG_QUALITY = 95
 # Nanoseconds. Timestamps of the built-in world start at zero; this offset gives them as many digits as real ones, so
 # that their order as text is their order in time.
 _START_NS = {"A": 315_000_000_000_000_000, "B": 1_500_000_000_000_000_000}
-# Metres; a segment lies on a centerline if all of its points are nearer than this.
-_ON_LANE = 0.5
 
 
 def export_openlane_v2(
@@ -220,18 +219,6 @@ def dense(line: Float[np.ndarray, "p 3"], count: int = DENSE_POINTS) -> Float[np
         return resample(line, count)
     places = np.linspace(0.0, pieces, count)
     return np.stack([np.interp(places, np.arange(pieces + 1), line[:, i]) for i in range(3)], -1)
-
-
-def segments_on_lanes(segments: LaneGraph, lanes: LaneGraph) -> Bool[np.ndarray, "s n"]:
-    """Return which valid segments lie on which valid centerlines, in the same direction."""
-    out = np.zeros((len(segments.valid), len(lanes.valid)), bool)
-    rows, columns = np.flatnonzero(segments.valid), np.flatnonzero(lanes.valid)
-    if not len(rows) or not len(columns):
-        return out
-    parts, wholes = np.asarray(segments.points[rows], float), np.asarray(lanes.points[columns], float)
-    distance, along = line_distances(parts, wholes)
-    out[np.ix_(rows, columns)] = (distance.max(-1) < _ON_LANE) & (along[..., -1] > along[..., 0])
-    return out
 
 
 def _governed(example: Example) -> Bool[np.ndarray, "n e"]:

@@ -12,8 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from tflane_jax.datasets.identities import line_distances
-from tflane_jax.geometry import transform_points
+from tflane_jax.geometry import line_distances, line_lengths, transform_points
 from tflane_jax.scene import LineType
 from tflane_jax.scene.logs import LaneSegment
 
@@ -108,7 +107,7 @@ def _join(lines: list[np.ndarray]) -> None:
 
 def _extended(line: Float[np.ndarray, "n 3"], piece: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, "k 3"] | None:
     """Return a line with the parts of a piece that lie beyond its ends; None where the two do not overlap."""
-    distance, place = (values[0, 0] for values in line_distances(piece[None], line[None]))
+    distance, place = line_distances(piece, line)
     last = len(line) - 1
     on = np.flatnonzero(distance < _SAME)
     if not len(on) or not (np.diff(place[on]) >= 0.0).all():
@@ -123,7 +122,7 @@ def _extended(line: Float[np.ndarray, "n 3"], piece: Float[np.ndarray, "m 3"]) -
 
 def _thinned(line: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "k 3"]:
     """Return every k-th point of a dense line, and its last one."""
-    length = float(np.linalg.norm(np.diff(line[:, :2], axis=0), axis=-1).sum())
+    length = float(line_lengths(line))
     stride = max(int(_SPACING * (len(line) - 1) / length), 1) if length > 0.0 else 1
     rows = np.unique(np.append(np.arange(0, len(line), stride), len(line) - 1))
     return np.asarray(line, np.float64)[rows]

@@ -19,7 +19,6 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
-from tflane_jax.datasets.identities import line_distances
 from tflane_jax.datasets.lane_outlines import LaneOutline, boundaries
 from tflane_jax.datasets.openlane_annotation import Annotation, read_annotation
 from tflane_jax.datasets.openlane_frames import frame_pose
@@ -27,7 +26,7 @@ from tflane_jax.datasets.plausible import check_motion
 from tflane_jax.errors import UserError
 from tflane_jax.files.fields import load_json, member
 from tflane_jax.files.openlane import CENTERLINE, SEGMENT
-from tflane_jax.geometry import transform_points
+from tflane_jax.geometry import line_distances, transform_points
 from tflane_jax.geometry.polylines import arc_length, resample_lines, sample_at
 from tflane_jax.scene import AreaType, LineType
 from tflane_jax.scene.logs import LaneSegment, VectorMap
@@ -200,8 +199,8 @@ def same_lines(now: Sequence[np.ndarray], before: Sequence[np.ndarray]) -> dict[
     if not len(now) or not len(before):
         return {}
     ours, theirs = (resample_lines(list(lines), _POINTS) for lines in (now, before))
-    there, place = line_distances(ours, theirs)
-    back = line_distances(theirs, ours)[0].mean(-1).T
+    there, place = line_distances(ours[:, None], theirs)
+    back = line_distances(theirs[:, None], ours)[0].mean(-1).T
     apart = np.minimum(there.mean(-1), back) + 1e-3 * np.maximum(there.mean(-1), back)
     # The same direction.
     apart = np.where(place[..., -1] >= place[..., 0], apart, 1e6)
@@ -222,8 +221,8 @@ def _station(line: np.ndarray, along: np.ndarray, point: np.ndarray) -> float:
     """Return the distance along a line of its place nearest to a point."""
     if len(line) < 2:
         return 0.0
-    _, place = line_distances(point[None, None], line[None])
-    return float(np.interp(place[0, 0, 0], np.arange(len(line)), along))
+    _, place = line_distances(point[None], line)
+    return float(np.interp(place[0], np.arange(len(line)), along))
 
 
 def _without_copies(lines: Sequence[np.ndarray]) -> Int[np.ndarray, " n"]:
@@ -232,7 +231,7 @@ def _without_copies(lines: Sequence[np.ndarray]) -> Int[np.ndarray, " n"]:
     if not len(lines):
         return keep
     dense = resample_lines(list(lines), _POINTS)
-    distance, place = line_distances(dense, dense)
+    distance, place = line_distances(dense[:, None], dense)
     on = (distance.max(-1) < 0.5 * _SAME) & (place[..., -1] > place[..., 0])
     length = np.array([arc_length(line)[-1] for line in lines])
     for i in np.argsort(length, kind="stable").tolist():

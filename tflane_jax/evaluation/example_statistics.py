@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 
 from tflane_jax.datasets.base import ExampleConfig
 from tflane_jax.evaluation.lane_groups import HALF, driven_fraction, lane_groups
-from tflane_jax.geometry import PerceptionRange
+from tflane_jax.geometry import PerceptionRange, line_lengths
 from tflane_jax.priors.traffic_flow import TrafficFlowPriorConfig
 from tflane_jax.scene import Example, LaneGraph, LineClass, MapLines, RoadUser, TrafficFlow
 
@@ -31,7 +31,7 @@ def example_stats(example: Example, config: ExampleConfig) -> dict[str, float]:
         driven, _ = driven_fraction(np.asarray(lanes.points)[lanes.valid], flow)
     found = _lane_stats(lanes, driven)
     if flow is not None and driven is not None and example.bev is not None:
-        groups, metres = lane_groups(lanes, np.asarray(example.bev), flow, config.ground), _lengths(lanes)
+        groups, metres = lane_groups(lanes, np.asarray(example.bev), flow, config.ground), _metres(lanes)
         found |= {f"lanes {name}": members.sum() for name, members in groups.items()}
         found |= {f"metres of lanes {name}": metres[members].sum() for name, members in groups.items()}
     if flow is not None and driven is not None:
@@ -42,8 +42,7 @@ def example_stats(example: Example, config: ExampleConfig) -> dict[str, float]:
 def _line_stats(lines: MapLines) -> dict[str, float]:
     """Return the number and the length of the lines of a vector map by class."""
     valid, category = np.asarray(lines.valid), np.asarray(lines.category)
-    points = np.where(valid[:, None, None], np.asarray(lines.points), 0.0)[..., :2]
-    metres = np.linalg.norm(np.diff(points, axis=1), axis=-1).sum(-1)
+    metres = line_lengths(np.where(valid[:, None, None], np.asarray(lines.points), 0.0))
     found = {}
     for kind in LineClass:
         chosen, name = valid & (category == kind), kind.name.lower()
@@ -55,7 +54,7 @@ def _lane_stats(lanes: LaneGraph, driven: Float[np.ndarray, " g"] | None) -> dic
     """Return the quantities of lanes; `driven` is the fraction of each valid lane that vehicles drove along."""
     valid = np.asarray(lanes.valid)
     hidden = np.asarray(lanes.visibility)[valid] < _HIDDEN
-    metres = _lengths(lanes)
+    metres = _metres(lanes)
     found = {
         "lanes": valid.sum(),
         "lanes out of sight": hidden.sum(),
@@ -69,10 +68,9 @@ def _lane_stats(lanes: LaneGraph, driven: Float[np.ndarray, " g"] | None) -> dic
     return found
 
 
-def _lengths(lanes: LaneGraph) -> Float[np.ndarray, " g"]:
-    """Return the lengths of the valid lanes in the ground plane, metres."""
-    step = np.diff(np.asarray(lanes.points)[np.asarray(lanes.valid)][..., :2], axis=1)
-    return np.linalg.norm(step, axis=-1).sum(-1)
+def _metres(lanes: LaneGraph) -> Float[np.ndarray, " g"]:
+    """Return the lengths of the valid lanes."""
+    return line_lengths(np.asarray(lanes.points)[np.asarray(lanes.valid)])
 
 
 def _traffic_stats(flow: TrafficFlow, config: ExampleConfig) -> dict[str, float]:

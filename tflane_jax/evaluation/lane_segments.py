@@ -8,7 +8,6 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.special import expit
 
-from tflane_jax.datasets.openlane_export import segments_on_lanes
 from tflane_jax.evaluation.centerlines import detections_of_elements
 from tflane_jax.metrics.frames import ElementDetections, ElementTruth, LaneDetections, LaneTruth
 from tflane_jax.metrics.segment_matching import CROSSING, AreaDetections, AreaTruth, SegmentDetections, SegmentTruth
@@ -21,6 +20,7 @@ from tflane_jax.scene import (
     SegmentPrediction,
     TrafficElements,
 )
+from tflane_jax.scene.lane_segments import segments_on_lanes
 
 SEGMENT_CLASSES = ("lane_segment", "ped_crossing")
 """Classes of LaneSegNet's queries."""

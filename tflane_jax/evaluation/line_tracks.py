@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.optimize import linear_sum_assignment
 
-from tflane_jax.geometry import invert_pose
+from tflane_jax.geometry import invert_pose, line_distances
 
 SAME = 1.5  # metres, the largest threshold of MapTR's AP
 SHARED = 0.25  # of a line's points
@@ -90,7 +90,7 @@ def _cost(
     low, high = lines.min(1)[:, None] - SAME, lines.max(1)[:, None] + SAME
     meets = ((low <= known.max(1)) & (known.min(1) <= high)).all(-1)
     row, column = np.nonzero(meets & same_class)
-    there, back = _distances(lines[row], known[column]), _distances(known[column], lines[row])
+    (there, _), (back, _) = line_distances(lines[row], known[column]), line_distances(known[column], lines[row])
     near = np.maximum(_near_part(there), _near_part(back))
     cost = np.full(same_class.shape, _FAR)
     # All points decide between lines that overlap in part.
@@ -102,14 +102,3 @@ def _near_part(distance: Float[np.ndarray, "k n"]) -> Float[np.ndarray, " k"]:
     """Return the mean of the smallest distances of each pair of lines."""
     count = max(round(SHARED * distance.shape[-1]), 1)
     return np.partition(distance, count - 1, axis=-1)[..., :count].mean(-1)
-
-
-def _distances(lines: Float[np.ndarray, "k n 2"], others: Float[np.ndarray, "k n 2"]) -> Float[np.ndarray, "k n"]:
-    """Return the distance of every vertex of a line to the other line of its pair, metres."""
-    step = np.diff(others, axis=1)
-    square = np.maximum((step**2).sum(-1), 1e-12)[:, None]
-    from_start = [lines[:, :, None, axis] - others[:, None, :-1, axis] for axis in (0, 1)]
-    along = sum(part * step[:, None, :, axis] for axis, part in enumerate(from_start)) / square
-    along = np.clip(along, 0.0, 1.0)
-    across = [part - along * step[:, None, :, axis] for axis, part in enumerate(from_start)]
-    return np.sqrt((across[0] ** 2 + across[1] ** 2).min(-1))

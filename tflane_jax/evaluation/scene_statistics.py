@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import KDTree
 
-from tflane_jax.geometry.polylines import resample_lines
+from tflane_jax.geometry import line_lengths, resample_lines, segment_distances
 from tflane_jax.scene import Areas, AreaType, Example, LaneGraph, LineType
 
 FRAME_QUANTITIES = (
@@ -60,7 +60,7 @@ def frame_quantities(example: Example) -> dict[str, Float[np.ndarray, " 1"]]:
     found = {
         "lanes": valid.sum(),
         "connectors": (valid & np.asarray(lanes.is_connector)).sum(),
-        "metres of lane": _lengths(lanes).sum(),
+        "metres of lane": line_lengths(np.asarray(lanes.points, float)[valid]).sum(),
         "topology links": (np.asarray(lanes.successor) & valid[:, None] & valid).sum(),
         "crossings": (known & (category == AreaType.PEDESTRIAN_CROSSING)).sum(),
         "road boundaries": (known & (category == AreaType.ROAD_BOUNDARY)).sum(),
@@ -113,8 +113,7 @@ def _around_the_vehicle(lanes: LaneGraph) -> dict[str, float]:
     # A half-open piece counts a lane once where it passes the vehicle.
     passes = (start[..., 0] <= 0.0) != (points[:, 1:, 0] <= 0.0)
     # The nearest point of every piece: none where there are no lanes.
-    along = np.clip(-(start * step).sum(-1) / np.maximum(metres, 1e-6) ** 2, 0.0, 1.0)
-    distance = np.linalg.norm(start + along[..., None] * step, axis=-1).min(-1, initial=np.inf)
+    distance = segment_distances(np.zeros(2), start, step)[1].min(-1, initial=np.inf)
     on_connector = len(distance) > 0 and bool(np.asarray(lanes.is_connector)[lanes.valid][distance.argmin()])
     oblique = (np.abs(ahead) > _OBLIQUE[1]) & (np.abs(ahead) < _OBLIQUE[0])
     return {
@@ -129,8 +128,3 @@ def pooled(frames: Sequence[Mapping[str, Float[np.ndarray, " _"]]]) -> dict[str,
     """Return the values of all frames by quantity, in the order in which quantities first appear."""
     names = dict.fromkeys(name for frame in frames for name in frame)
     return {name: np.concatenate([frame[name] for frame in frames if name in frame]) for name in names}
-
-
-def _lengths(lanes: LaneGraph) -> Float[np.ndarray, " n"]:
-    points = np.asarray(lanes.points, float)[np.asarray(lanes.valid)][..., :2]
-    return np.linalg.norm(np.diff(points, axis=1), axis=-1).sum(-1)

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.special import expit
 
-from tflane_jax.datasets.identities import line_distances
+from tflane_jax.geometry import line_distances, line_lengths
 from tflane_jax.metrics.map_matching import CLASSES, Dims, MapDetections, MapTruth
 from tflane_jax.scene import Areas, AreaType, LaneGraph, LinePrediction, LineType, MapLines
 
@@ -44,8 +44,8 @@ def dividers(segments: LaneGraph) -> list[Float[np.ndarray, "p 2"]]:
     lines = np.concatenate(painted)[..., :2].astype(np.float64)
     if len(lines) == 0:
         return []
-    lengths = np.linalg.norm(np.diff(lines, axis=1), axis=-1).sum(-1)
-    covered = line_distances(lines, lines)[0].max(-1) < _SAME_LINE
+    lengths = line_lengths(lines)
+    covered = line_distances(lines[:, None], lines)[0].max(-1) < _SAME_LINE
     kept: list[int] = []
     for i in np.argsort(-lengths, kind="stable").tolist():
         if not covered[i, kept].any():

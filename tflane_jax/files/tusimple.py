@@ -20,6 +20,8 @@ NO_POINT = -2.0
 """x of a row in which a lane has no point."""
 SIZE = (720, 1280)
 """Height and width of TuSimple's images, pixels."""
+ROWS = np.arange(160.0, 720.0, 10.0)
+"""(56,) rows of the test set's labels, pixels of an image of height `SIZE[0]`."""
 NO_DRIVES = "TuSimple labels one image of each clip, and clips of one drive are drawn as if they were apart"
 """Why intervals over images are no intervals over drives."""
 _WIDEST = 1e6  # pixels

@@ -14,6 +14,8 @@ from tflane_jax.geometry.cameras import (
 from tflane_jax.geometry.polylines import (
     arc_length,
     clip_to_range,
+    line_distances,
+    line_lengths,
     nearest_lines,
     resample,
     resample_lines,
@@ -41,6 +43,8 @@ __all__ = [
     "ground_points",
     "inside_image",
     "invert_pose",
+    "line_distances",
+    "line_lengths",
     "matrix_from_quaternion",
     "nearest_lines",
     "pose_matrix",

@@ -17,7 +17,6 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float
 
-from tflane_jax.datasets.segment_targets import SegmentTargets
 from tflane_jax.limits import Fraction, PositiveOrZero
 from tflane_jax.losses.areas import AreaLossConfig, area_loss
 from tflane_jax.losses.auxiliary import auxiliary_losses, denoising_pairs
@@ -45,7 +44,14 @@ from tflane_jax.losses.traffic_elements import (
 )
 from tflane_jax.matching import Assignment, match
 from tflane_jax.models.auxiliary import AuxiliaryOutputs
-from tflane_jax.models.segment_truth import LANE, governed_rows, ordered_targets, target_lanes, target_lines
+from tflane_jax.models.segment_truth import (
+    LANE,
+    SegmentTargets,
+    governed_rows,
+    ordered_targets,
+    target_lanes,
+    target_lines,
+)
 from tflane_jax.scene import ElementPrediction, Example, Prediction, SegmentPrediction
 
 

@@ -22,7 +22,6 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from tflane_jax.datasets.segment_targets import Center
 from tflane_jax.layers.precision import run_layer
 from tflane_jax.limits import Rules, check_settings
 from tflane_jax.models.area_decoder import PAPER_AREA_DECODER, AreaDecoder, AreaDecoderConfig
@@ -43,7 +42,7 @@ from tflane_jax.models.lane_segments import (
 from tflane_jax.models.parameters import with_equal_heads
 from tflane_jax.models.prior import HostQueries
 from tflane_jax.models.priors import ByPrior, fuse_into_queries
-from tflane_jax.models.segment_truth import ordered_targets, target_lanes
+from tflane_jax.models.segment_truth import Center, ordered_targets, target_lanes
 from tflane_jax.scene import ElementPrediction, LaneGraph, Prediction, SegmentPrediction
 
 
@@ -56,7 +55,7 @@ class LaneSegNetConfig(HostConfig):
         denoising: noised segments in training (`models.lane_denoising`); None as in the paper.
         last_step: "twice": outside training, the last layer's change of the centerline is applied to its own result
             once more. The published code does so by mistake, and its weights reach their published numbers with it.
-        center: the centerline that is learned, see `datasets.segment_targets`.
+        center: the centerline that is learned, see `segment_truth.segment_targets`.
         areas: decoder of crossings and road boundaries, as in the map-element-bucket variant; crossings are then no
             class of the segments (`decoder.classes=1`). None: crossings are segments of the second class.
         encoder, range, priors, elements: see `HostConfig`; elements need as many layers as the decoder.

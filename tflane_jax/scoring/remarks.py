@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from tflane_jax.datasets.lane_rows import ROWS
-from tflane_jax.files.tusimple import RowLanes
+from tflane_jax.files.tusimple import ROWS, RowLanes
 from tflane_jax.metrics.frames import LaneDetections, LaneTruth, Lines
 from tflane_jax.metrics.map_matching import MapDetections, MapTruth
 from tflane_jax.metrics.segment_matching import SegmentDetections, SegmentTruth

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tflane_jax.datasets.segment_targets import segment_targets
+from tflane_jax.models.segment_truth import segment_targets
 from tflane_jax.scene import Areas, AreaType, LaneGraph, LineType
 
 POINTS = 4

@@ -15,6 +15,7 @@ from tflane_jax.metrics import (
     ElementDetections,
     ElementTruth,
     GroupedCenterlineMetrics,
+    GroupedMapMetrics,
     GroupedSegmentMetrics,
     LaneSegmentMetrics,
     MapConsistency,
@@ -125,6 +126,7 @@ CASES = {
     "segments, devkit": (LaneSegmentMetrics, update, segments),
     "segments, groups": (lambda: GroupedSegmentMetrics(**GROUPS), update_groups, segments),
     "lines": (VectorMapMetrics, update, lines),
+    "lines, groups": (lambda: GroupedMapMetrics(("all",), **GROUPS), update_groups, lines),
     "lines without centerlines": (VectorMapMetrics, update, lambda number: lines(number, centerlines=False)),
 }
 NAMES_OF = {
@@ -134,6 +136,7 @@ NAMES_OF = {
     "segments, devkit": {"DET_l", "DET_a", "AP_l", "TOP_ll"},
     "segments, groups": {"all/mAP", "clear/AP_ls", "near/AP_ped", "odd/TOP_lsls"},
     "lines": {"mAP", "AP_divider", "AP_ped_crossing", "AP_boundary", "AP_centerline"},
+    "lines, groups": {"all/AP_centerline", "near/AP_centerline", "far/mAP", "odd/AP_divider"},
     "lines without centerlines": {"mAP", "AP_divider", "AP_ped_crossing", "AP_boundary"},
 }
 

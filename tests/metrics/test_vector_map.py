@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from tests.metrics.fixtures import expected_cases, load_maps
 from tflane_jax.errors import UserError
-from tflane_jax.metrics import MapDetections, MapTruth, VectorMapMetrics
+from tflane_jax.metrics import GroupedMapMetrics, MapDetections, MapTruth, VectorMapMetrics
 from tflane_jax.metrics.map_matching import CLASSES, MAP_THRESHOLDS, Sampling, match_map
 
 # What the official program calls the three ways of sampling detections.
@@ -122,6 +122,35 @@ def test_by_hand():
     assert result["mAP"] == pytest.approx(2 / 9)
     assert [result[f"mAP@{t}"] for t in MAP_THRESHOLDS] == [0.5, 0.5, 1.0]
     assert (result["frames"], result["lines"]) == (1, 1)
+
+
+def test_a_class_that_a_part_lacks_does_not_count_there():
+    """All lines are found and none is a crossing, which counts 0 in the whole, as officially, and in no part of it."""
+    metrics = GroupedMapMetrics(frame_groups=("both", "boundary", "nowhere"), lane_groups=("dividers", "none"))
+    for group, numbers in (("both", [0, 2]), ("boundary", [2])):
+        lines, classes = [line(9.0 * number) for number in numbers], np.array(numbers)
+        truth = MapTruth(lines, classes, visibility=np.where(classes == 0, 0.1, 0.9))
+        members = {"dividers": classes == 0, "none": classes == 1}
+        metrics.update(MapDetections(lines, classes, np.full(len(lines), 0.9)), truth, group, members)
+    result, samples = metrics.compute(), metrics.resampled(np.array([[1, 1], [0, 1], [0, 0]]))
+    whole = {name: value for name, value in result["all"].items() if "@" not in name}
+    assert whole == {
+        "frames": 2,
+        "lines": 3,
+        "mAP": pytest.approx(2 / 3),
+        "AP_divider": 1.0,
+        "AP_ped_crossing": 0.0,
+        "AP_boundary": 1.0,
+        "recall": 1.0,
+    }
+    assert samples["all"]["mAP"] == pytest.approx([2 / 3, 1 / 3, 0.0])
+    assert samples["clear"]["mAP"].tolist() == [1.0, 1.0, 0.0]
+    parts = {"occluded": {0}, "clear": {2}, "both": {0, 2}, "boundary": {2}, "dividers": {0}, "none": (), "nowhere": ()}
+    for part, present in parts.items():
+        names = {f"AP_{CLASSES[c]}" for c in present} | ({"mAP"} if present else set())
+        assert {name for name in result[part] if "AP" in name and "@" not in name} == samples[part].keys() == names
+        assert {name.split("@")[0] for name in result[part] if "AP" in name} == names
+        assert all(result[part][name] == 1.0 for name in names)
 
 
 def test_classes_do_not_mix():

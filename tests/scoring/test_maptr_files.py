@@ -14,6 +14,8 @@ from tflane_jax.metrics import MapDetections, MapTruth
 from tflane_jax.metrics.map_matching import CLASSES, LINE_CLASSES
 from tflane_jax.scoring.maptr import read_predictions, read_truth, write_predictions
 
+FILES = ("nuscmap_results.json", "anns.json")
+
 
 def vectors(lines, scores=None):
     return [
@@ -32,11 +34,10 @@ def write(folder, samples, change=lambda results: None):
     (folder / "anns.json").write_text(json.dumps({"GTs": truth}))
 
 
-def run(folder, protocol="maptr"):
-    out = folder / "out"
-    files = [str(folder / "nuscmap_results.json"), str(folder / "anns.json")]
-    code = main(["score", protocol, *files, "--out", str(out)])
-    return code, json.loads(out.with_suffix(".json").read_text())["rows"][0] if code == 0 else {}
+def run(folder, protocol="maptr", *more):
+    """Return the exit code and the first row."""
+    code = main(["score", protocol, *(str(folder / n) for n in FILES), "--out", str(folder / "out"), *more])
+    return code, json.loads((folder / "out.json").read_text())["rows"][0] if code == 0 else {}
 
 
 @pytest.fixture
@@ -74,6 +75,36 @@ def test_centerlines_are_a_fourth_class(tmp_path):
     assert code == 0
     assert (row["AP_divider"], row["AP_centerline"]) == (1.0, pytest.approx(2 / 3))
     assert row["mAP"] == pytest.approx((1 + 2 / 3) / 4)
+
+
+@pytest.mark.parametrize("protocol", ["maptr", "maptrv2-iou"])
+@pytest.mark.parametrize("by", ["occlusion", "distance", "scene"])
+def test_parts_of_identical_lines_have_the_full_score(tmp_path, capsys, by, protocol):
+    """Each part has one class: a class without true lines counts 0 in the whole alone."""
+    if protocol.endswith("iou"):
+        pytest.importorskip("shapely")
+    parts = {"occlusion": ("occluded", "clear"), "distance": ("0 to 10 m", "20 to 30 m"), "scene": ("s0", "s1")}[by]
+    samples = []
+    for x, c in ((5.0, 0), (25.0, 2)):
+        lines, classes = [np.array([[x, 0.0], [x, 9.0]])], np.array([c])
+        samples.append((MapDetections(lines, classes, np.array([0.9])), MapTruth(lines, classes)))
+    write(tmp_path, samples)
+    truth = json.loads((tmp_path / "anns.json").read_text())
+    for sample, visibility in zip(truth["GTs"], (0.1, 0.9), strict=True):
+        sample["vectors"][0]["visibility"] = visibility
+    (tmp_path / "anns.json").write_text(json.dumps(truth))
+    code, whole = run(tmp_path, protocol, "--by", by)
+    assert code == 0
+    assert (whole["mAP"], whole["AP_ped_crossing"]) == (pytest.approx(2 / 3), 0.0)
+    table = [[cell.strip() for cell in line.split("|")[1:-1]] for line in capsys.readouterr().out.splitlines()]
+    names = next(cells for cells in table if "mAP" in cells)
+    printed = {cells[0]: dict(zip(names, cells, strict=True)) for cells in table if len(cells) == len(names)}
+    for part, present in zip(parts, ("AP_divider", "AP_boundary"), strict=True):
+        aps = {name: value for name, value in printed[part].items() if name.startswith("AP_")}
+        assert printed[part]["mAP"] == aps.pop(present) == "1.0000"
+        assert set(aps.values()) == {"-"}
+    if by == "distance":
+        assert (printed["10 to 20 m"]["mAP"], printed["10 to 20 m"]["lines"]) == ("-", "0")
 
 
 def test_a_count_of_points_that_is_an_array_is_named(tmp_path):

@@ -43,7 +43,9 @@ def run(options: argparse.Namespace) -> int:
         remarks.append(f"{protocol.no_scenes}: the intervals are too narrow (name the drives by --scenes FILE)")
     for remark in remarks:
         print(f"tflane: {remark}", file=sys.stderr)
-    rows = _rows(scored, options.by, options.bootstrap)
+    rows = _rows(scored, options.bootstrap)
+    if options.by == "scene":
+        rows += [{"part": name, **values} for name, values in scored.by_scene(protocol.of_scene).items()]
     rows += [{"part": group} | shown_of_part(values) for group, values in (groups or {}).items() if group != "all"]
 
     title = f"{options.predictions.name}: {scored.protocol}"
@@ -94,12 +96,10 @@ def _scored(files: str, run_score: Callable[[], Scored]) -> Scored:
         raise UserError(f"{files}: {error}") from None
 
 
-def _rows(scored: Scored, by: str | None, samples: int) -> list[dict[str, Any]]:
+def _rows(scored: Scored, samples: int) -> list[dict[str, Any]]:
     rows: list[dict[str, Any]] = [{"part": "all", **scored.total()}]
     if samples:
         ends = scored.intervals(samples)
         for i, name in enumerate(("low, 2.5 %", "high, 97.5 %")):
             rows.append({"part": name} | {k: v[i] for k, v in ends.items() if isinstance(rows[0].get(k), float)})
-    if by == "scene":
-        rows += [{"part": name, **values} for name, values in scored.by_scene().items()]
     return rows

@@ -8,7 +8,8 @@ Every frame is matched once, with all lanes and all detections, by the official 
 - topology scores pool the vertex precisions of the lanes in S; their neighbours may lie outside S.
 
 `all` is the official number. The groups of a partition share its lanes and its vertices, and its detections in frames
-with lanes. Traffic elements and areas count only in `all` and in groups of frames.
+with lanes. Traffic elements and areas count only in `all` and in groups of frames. Published conventions for what the
+truth lacks hold for `all`: in a part of a map, a class without true lines has no average precision.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import copy
 import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Generic, Protocol, Self, TypeVar
+from typing import Any, Generic, Literal, Protocol, Self, TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -29,6 +30,9 @@ from tflane_jax.metrics.resampling import Weights
 
 COUNTS = ("frames", "lanes", "lines")
 """Numbers of a group that are no scores, but what its scores rest on."""
+
+Scope = Literal["all", "frames", "lanes"]
+"""What an accumulator holds: the whole test set, some of its frames, or some of the lanes or lines of every frame."""
 
 
 def shown_of_part(values: Mapping[str, Any]) -> dict[str, Any]:
@@ -89,15 +93,15 @@ class LaneMetrics(Protocol):
         """Return an accumulator of the frames of all."""
         ...
 
-    def compute(self) -> dict[str, float]:
-        """Return the numbers."""
+    def compute(self, scope: Scope = "all") -> dict[str, float]:
+        """Return the numbers that this scope has."""
         ...
 
     def means(self) -> dict[str, Float[np.ndarray, "f 2"]]:
         """Return the scores, recall aside, that are ratios of two sums over frames: the terms of both sums."""
         ...
 
-    def resampled(self, weights: Weights) -> dict[str, Float[np.ndarray, " b"]]:
+    def resampled(self, weights: Weights, scope: Scope = "all") -> dict[str, Float[np.ndarray, " b"]]:
         """Return the scores that rank detections, in samples that count the frames as often as `weights` says."""
         ...
 
@@ -267,7 +271,7 @@ class GroupedMetrics(Generic[FrameT]):
 
     def compute(self) -> dict[str, dict[str, float]]:
         """Return the numbers of each group."""
-        return {group: metrics.compute() for group, metrics in self._metrics.items()}
+        return {group: metrics.compute(self._scope(group)) for group, metrics in self._metrics.items()}
 
     def means(self) -> dict[str, dict[str, Float[np.ndarray, "f 2"]]]:
         """Return by group the scores that are ratios of two sums over frames: the terms of both sums, by frame."""
@@ -282,9 +286,14 @@ class GroupedMetrics(Generic[FrameT]):
         The samples are exact, see `metrics.resampling`.
         """
         return {
-            group: metrics.resampled(weights[:, np.array(self._measures[group], bool)])
+            group: metrics.resampled(weights[:, np.array(self._measures[group], bool)], self._scope(group))
             for group, metrics in self._metrics.items()
         }
+
+    def _scope(self, group: str) -> Scope:
+        if group == "all":
+            return "all"
+        return "frames" if group in self._frame_groups else "lanes"
 
 
 def _spread(parts: Float[np.ndarray, "m 2"], measured: Sequence[bool]) -> Float[np.ndarray, "f 2"]:

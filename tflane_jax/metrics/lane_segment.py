@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float
 
 from tflane_jax.errors import UserError
 from tflane_jax.metrics.centerline_matching import LANE_THRESHOLDS
-from tflane_jax.metrics.groups import BY_OCCLUSION, FrameGroup, GroupedMetrics, Partition
+from tflane_jax.metrics.groups import BY_OCCLUSION, FrameGroup, GroupedMetrics, Partition, Scope
 from tflane_jax.metrics.matching import average_precision_11, pooled
 from tflane_jax.metrics.merging import joined
 from tflane_jax.metrics.openlane_v2 import CenterlineMetrics
@@ -87,7 +87,7 @@ class LaneSegmentMetrics:
             setattr(merged, name, joined([getattr(each, name) for each in (self, *others)]))
         return merged
 
-    def compute(self) -> dict[str, float]:
+    def compute(self, scope: Scope = "all") -> dict[str, float]:
         """Return the metrics of the flavour, 0 to 1, and what they count.
 
         - both: `frames`, `lanes`, the areas by threshold, `crossing@0.5` ... `boundary@1.5`, and the mean errors of the
@@ -98,6 +98,8 @@ class LaneSegmentMetrics:
           instead of `OLS`;
         - "LaneSegNet": `AP_ls` and `AP_ls@1.0` ..., `AP_ped`, `AP_boundary`, `mAP` (of the first two), `TOP_lsls`, and
           `recall` and `AP_l` as `CenterlineMetrics.compute`.
+
+        Some of the segments (`scope` "lanes") have no areas, and therefore none of the numbers that rest on areas.
         """
         lanes = self._lanes.compute()
         scores, categories, hits = pooled(self._area_detections, (0,), (len(AREA_THRESHOLDS), 0))
@@ -118,20 +120,20 @@ class LaneSegmentMetrics:
             means = {"AP_ls": ap_ls, "AP_ped": ap_ped, "AP_boundary": float(np.mean(precision["boundary"]))}
             totals = {"mAP": (ap_ls + ap_ped) / 2, "TOP_lsls": lanes["TOP_ll"]}
             found = {name: value for name, value in lanes.items() if name == "AP_l" or name.startswith("recall")}
-            return count | means | totals | segments | found | areas | self._matched_errors()
+            return _in_scope(count | means | totals | segments | found | areas | self._matched_errors(), scope)
         lanes.pop("OLS", None)
         lanes["DET_a"] = float(np.mean(list(areas.values())))
         if "DET_t" in lanes:
             detection = [lanes["DET_l"], lanes["DET_a"], lanes["DET_t"]]
             lanes["OLUS"] = float(np.mean([*detection, lanes["TOP_ll"] ** 0.5, lanes["TOP_lt"] ** 0.5]))
-        return lanes | areas | self._matched_errors()
+        return _in_scope(lanes | areas | self._matched_errors(), scope)
 
     def means(self) -> dict[str, Float[np.ndarray, "f 2"]]:
         """Return the scores that are means over vertices, see `CenterlineMetrics.means`."""
         lanes = self._lanes.means()
         return {"TOP_lsls": lanes["TOP_ll"]} if self.flavour == "LaneSegNet" else lanes
 
-    def resampled(self, weights: Weights) -> dict[str, Float[np.ndarray, " b"]]:
+    def resampled(self, weights: Weights, scope: Scope = "all") -> dict[str, Float[np.ndarray, " b"]]:
         """Return AP, mAP, DET, TOP and OLUS of samples that count the frames as often as `weights` says."""
         lanes = self._lanes.resampled(weights)
         scores, categories, hits = pooled(self._area_detections, (0,), (len(AREA_THRESHOLDS), 0))
@@ -143,13 +145,14 @@ class LaneSegmentMetrics:
         )
         if self.flavour == "LaneSegNet":
             areas = {"AP_ped": crossing, "AP_boundary": boundary, "mAP": (lanes["DET_l"] + crossing) / 2}
-            return {"AP_ls": lanes["DET_l"], "AP_l": lanes["AP_l"], "TOP_lsls": lanes["TOP_ll"]} | areas
+            segments = {"AP_ls": lanes["DET_l"], "AP_l": lanes["AP_l"], "TOP_lsls": lanes["TOP_ll"]}
+            return _in_scope(segments | areas, scope)
         lanes.pop("OLS", None)
         lanes["DET_a"] = (crossing + boundary) / 2
         if "DET_t" in lanes:
             roots = lanes["TOP_ll"] ** 0.5, lanes["TOP_lt"] ** 0.5
             lanes["OLUS"] = np.mean([lanes["DET_l"], lanes["DET_a"], lanes["DET_t"], *roots], axis=0)
-        return lanes
+        return _in_scope(lanes, scope)
 
     def _matched_errors(self) -> dict[str, float]:
         errors = {}
@@ -182,7 +185,6 @@ class GroupedSegmentMetrics(GroupedMetrics[MatchedSegments]):
     ) -> None:
         make = partial(LaneSegmentMetrics, flavour)
         super().__init__(make, partition, groups, frame_groups=frame_groups, lane_groups=lane_groups)
-        self._whole = frozenset({"all", *frame_groups})
 
     def update(
         self,
@@ -197,16 +199,10 @@ class GroupedSegmentMetrics(GroupedMetrics[MatchedSegments]):
         """
         self.add(match_segments(detections, truth, nearest="all"), truth.lanes, frame_group, members)
 
-    def compute(self) -> dict[str, dict[str, float]]:
-        """Return the numbers of each group."""
-        return {group: self._reported(group, values) for group, values in super().compute().items()}
 
-    def resampled(self, weights: Weights) -> dict[str, dict[str, Float[np.ndarray, " b"]]]:
-        """Return the numbers of each group in samples of the frames."""
-        return {group: self._reported(group, values) for group, values in super().resampled(weights).items()}
-
-    def _reported(self, group: str, values: Mapping[str, T]) -> dict[str, T]:
-        return {name: value for name, value in values.items() if group in self._whole or not _of_areas(name)}
+def _in_scope(values: dict[str, T], scope: Scope) -> dict[str, T]:
+    """Return the numbers that the scope has: some of the segments have none of areas."""
+    return {name: value for name, value in values.items() if scope != "lanes" or not _of_areas(name)}
 
 
 def _of_areas(name: str) -> bool:

@@ -20,7 +20,7 @@ from tflane_jax.errors import UserError
 from tflane_jax.files.openlane import ATTRIBUTES
 from tflane_jax.metrics.centerline_matching import LANE_THRESHOLDS, MatchedFrame, match_frame
 from tflane_jax.metrics.frames import LaneDetections, LaneTruth
-from tflane_jax.metrics.groups import BY_OCCLUSION, FrameGroup, GroupedMetrics, Partition
+from tflane_jax.metrics.groups import BY_OCCLUSION, FrameGroup, GroupedMetrics, Partition, Scope
 from tflane_jax.metrics.matching import average_precision_11, average_precision_area, pooled, ranked
 from tflane_jax.metrics.merging import joined
 from tflane_jax.metrics.resampling import Weights, frame_numbers, resampled_mean, resampled_precisions
@@ -93,8 +93,8 @@ class CenterlineMetrics:
             setattr(merged, name, joined([getattr(each, name) for each in (self, *others)]))
         return merged
 
-    def compute(self) -> dict[str, float]:
-        """Return the metrics, 0 to 1, and what they count.
+    def compute(self, scope: Scope = "all") -> dict[str, float]:
+        """Return the metrics, 0 to 1, and what they count; the same rules for every `scope`.
 
         - `frames`, `lanes`: number of frames and of true lanes;
         - `DET_l` and, per threshold in metres, `DET_l@1.0`, `DET_l@2.0`, `DET_l@3.0` (1 if there is neither a true
@@ -148,7 +148,7 @@ class CenterlineMetrics:
                     found[name + suffix] = parts[:, row, [column, -1]]
         return found
 
-    def resampled(self, weights: Weights) -> dict[str, Float[np.ndarray, " b"]]:
+    def resampled(self, weights: Weights, scope: Scope = "all") -> dict[str, Float[np.ndarray, " b"]]:
         """Return DET, AP_l, TOP and OLS of samples that count the frames as often as `weights` says."""
         truths = np.array(self._frame_truths, int).reshape(-1, 1 + ATTRIBUTES)
         scores, hits = pooled(self._lane_detections, (len(LANE_THRESHOLDS), 0))

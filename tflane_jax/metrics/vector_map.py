@@ -11,10 +11,10 @@ from functools import partial
 from typing import Self
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from tflane_jax.errors import UserError
-from tflane_jax.metrics.groups import BY_OCCLUSION, FrameGroup, GroupedMetrics, Partition
+from tflane_jax.metrics.groups import BY_OCCLUSION, FrameGroup, GroupedMetrics, Partition, Scope
 from tflane_jax.metrics.map_matching import (
     CLASSES,
     LINE_CLASSES,
@@ -62,14 +62,9 @@ class VectorMapMetrics:
     @property
     def protocol(self) -> str:
         """Name and version, the title of every table of these numbers."""
-        classes = ", with centerlines" if len(self.classes) > len(CLASSES) else ""
+        classes = ", with centerlines" if self._truths[len(CLASSES)] else ""
         heights = ", with heights" if self.dims == 3 else ""
         return f"{_NAMES[self.measure]} {_VERSIONS[self.sampling]}{heights}{classes}"
-
-    @property
-    def classes(self) -> tuple[str, ...]:
-        """The measured classes: with centerlines if there are true ones."""
-        return LINE_CLASSES if self._truths[len(CLASSES)] else CLASSES
 
     @property
     def thresholds(self) -> tuple[float, ...]:
@@ -98,58 +93,78 @@ class VectorMapMetrics:
             setattr(merged, name, joined([getattr(each, name) for each in (self, *others)]))
         return merged
 
-    def compute(self) -> dict[str, float]:
+    def compute(self, scope: Scope = "all") -> dict[str, float]:
         """Return the metrics, 0 to 1, and what they count.
 
         - `frames`, `lines`: number of frames and of true lines;
-        - `mAP`: mean over the `classes` of `AP_divider`, `AP_ped_crossing`, `AP_boundary` and `AP_centerline`, each the
-          mean over the thresholds (`AP_divider@0.5` ...); a class without true lines counts 0, as officially;
+        - `mAP`: mean over classes of `AP_divider`, `AP_ped_crossing`, `AP_boundary` and `AP_centerline`, each the mean
+          over the thresholds (`AP_divider@0.5` ...). Of the whole test set (`scope` "all"), a class without true lines
+          counts 0, as officially, except centerlines, which have no AP then. In a part, which may lack a class, no
+          class without true lines has an AP, and without any there is no `mAP`;
         - `mAP@0.5`, `mAP@1.0`, `mAP@1.5`: mean at one threshold over the classes **with** true lines, as the official
           program prints it under its tables (0 if there is none). `mAP` is their mean only if no class is missing;
         - `recall`: fraction of the true lines that are found, whatever the confidence; mean over the thresholds.
         """
-        thresholds, names = self.thresholds, self.classes
+        thresholds, measured = self.thresholds, np.flatnonzero(_counted(self._truths, scope))
         scores, classes, hits = ranked(*pooled(self._detections, (0,), (len(thresholds), 0)))
-        hits = hits.astype(bool)[:, classes < len(names)]
-        scores, classes = scores[classes < len(names)], classes[classes < len(names)]
-        truths = self._truths[: len(names)]
-        precision = np.array(
-            [
-                [average_precision_area(scores[members], row[members], int(count)) for row in hits]
-                for members, count in zip(classes == np.arange(len(names))[:, None], truths, strict=True)
+        hits = hits.astype(bool)
+        precision = {
+            LINE_CLASSES[c]: [
+                average_precision_area(scores[members], row[members], int(self._truths[c])) for row in hits
             ]
-        )
-        at_threshold = precision.sum(0) / max((truths > 0).sum(), 1)
-        found = hits.sum() / max(len(thresholds) * truths.sum(), 1)
+            for c in measured
+            for members in [classes == c]
+        }
+        table, present = np.array(list(precision.values())), max((self._truths[measured] > 0).sum(), 1)
+        lines = int(self._truths.sum())
+        whole = {"mAP": float(_mean_precision(table, np.ones(len(table), bool)))} if precision else {}
+        at_threshold = dict(zip(thresholds, table.sum(0) / present, strict=True)) if precision else {}
         return (
-            {"frames": self._frames, "lines": int(truths.sum()), "mAP": float(precision.mean())}
-            | {f"AP_{name}": float(row.mean()) for name, row in zip(names, precision, strict=True)}
-            | {"recall": float(found)}
-            | {f"mAP@{t}": float(value) for t, value in zip(thresholds, at_threshold, strict=True)}
-            | {
-                f"AP_{name}@{t}": float(value)
-                for name, row in zip(names, precision, strict=True)
-                for t, value in zip(thresholds, row, strict=True)
-            }
+            {"frames": self._frames, "lines": lines}
+            | whole
+            | {f"AP_{name}": float(np.mean(row)) for name, row in precision.items()}
+            | {"recall": float(hits.sum() / max(len(thresholds) * lines, 1))}
+            | {f"mAP@{t}": float(value) for t, value in at_threshold.items()}
+            | {f"AP_{name}@{t}": row[k] for name, row in precision.items() for k, t in enumerate(thresholds)}
         )
 
     def means(self) -> dict[str, Float[np.ndarray, "f 2"]]:
         """Return no score: all but recall rank detections."""
         return {}
 
-    def resampled(self, weights: Weights) -> dict[str, Float[np.ndarray, " b"]]:
-        """Return `mAP` and the `AP_...` of classes in samples that count the frames as often as `weights` says."""
+    def resampled(self, weights: Weights, scope: Scope = "all") -> dict[str, Float[np.ndarray, " b"]]:
+        """Return `mAP` and the `AP_...` of classes in samples that count the frames as often as `weights` says.
+
+        Classes are those of `compute`. An AP that a sample lacks is 0, and does not count in its `mAP`.
+        """
         scores, classes, hits = pooled(self._detections, (0,), (len(self.thresholds), 0))
         truths = np.array(self._frame_truths, int).reshape(-1, len(LINE_CLASSES))
-        frame, precision = frame_numbers(self._detections), []
-        for c in range(len(self.classes)):
+        frame, precision = frame_numbers(self._detections), {}
+        measured = np.flatnonzero(_counted(self._truths, scope))
+        for c in measured:
             own = classes == c
             _, area = resampled_precisions(scores[own], hits[:, own], frame[own], truths[:, c], weights)
-            precision.append(area.mean(1))
-        mean = np.mean(precision, axis=0)
-        if len(precision) > len(CLASSES):  # centerlines count in samples that have some
-            mean = np.where(weights @ truths[:, len(CLASSES)], mean, np.mean(precision[: len(CLASSES)], axis=0))
-        return {"mAP": mean} | {f"AP_{name}": values for name, values in zip(self.classes, precision, strict=True)}
+            precision[f"AP_{LINE_CLASSES[c]}"] = area.mean(1)
+        if not precision:
+            return {}
+        counted = _counted((weights @ truths).T, scope)[measured]
+        return {"mAP": _mean_precision(np.stack(list(precision.values()))[:, None], counted)} | precision
+
+
+def _counted(truths: Int[np.ndarray, "4 *b"], scope: Scope) -> Bool[np.ndarray, "4 *b"]:
+    """Return which classes count in mAP: those with true lines, and in the whole test set all but centerlines."""
+    counted = truths > 0
+    if scope == "all":
+        counted[: len(CLASSES)] = True
+    return counted
+
+
+def _mean_precision(
+    precision: Float[np.ndarray, "c k *b"], counted: Bool[np.ndarray, "c *b"]
+) -> Float[np.ndarray, "*b"]:
+    """Return the mean over the counted classes and over the thresholds; 0 where no class counts."""
+    total = np.where(counted[:, None], precision, 0.0).sum((0, 1))
+    return total / np.maximum(precision.shape[1] * counted.sum(0), 1)
 
 
 class GroupedMapMetrics(GroupedMetrics[MatchedMap]):

@@ -23,7 +23,7 @@ from tflane_jax.metrics.tusimple import LSTR_TIME_LIMIT, OFFICIAL_TIME_LIMIT, Tu
 from tflane_jax.metrics.vector_map import GroupedMapMetrics, VectorMapMetrics
 from tflane_jax.scoring import maptr, openlane_v2, plain, remarks
 from tflane_jax.scoring.recognise import Format, Side, hint
-from tflane_jax.scoring.score import Accumulator
+from tflane_jax.scoring.score import Accumulator, numbers_of
 
 
 @dataclass(frozen=True)
@@ -39,6 +39,7 @@ class ScoringProtocol:
         formats: of the files, for messages.
         groups: by a criterion that partitions lanes, "occlusion" or "distance": returns a new accumulator whose numbers
             are by group.
+        of_scene: returns the numbers of the accumulator of one scene, which may lack what the whole has.
         remarks: returns what is unusual, though not wrong, about predictions and truth.
         found: that one of the numbers which is 0 exactly if no predicted line is near a true one; "" for none.
         frame: axes, units and frame of the lines, or what else to look at, for a remark where none is near.
@@ -52,6 +53,7 @@ class ScoringProtocol:
     columns: tuple[str, ...]
     formats: tuple[Format, ...]
     groups: Mapping[str, Callable[[], Any]] = field(default_factory=dict)
+    of_scene: Callable[[Any], dict[str, Any]] = numbers_of
     remarks: remarks.Remarks = remarks.no_remarks
     found: str = ""
     frame: str = "x forward, y left, z up, metres in the vehicle's frame"
@@ -130,6 +132,7 @@ def _maptr(sampling: Sampling, measure: Measure = "chamfer", dims: Dims = 2) -> 
         metrics=partial(VectorMapMetrics, sampling, measure, dims),
         columns=("mAP", *(f"AP_{name}" for name in LINE_CLASSES)),
         formats=("MapTR",),
+        of_scene=lambda metrics: metrics.compute("frames"),
         remarks=remarks.units,
         found="mAP",
         frame="and are the classes right",

@@ -40,6 +40,11 @@ class Accumulator(Protocol):
         ...
 
 
+def numbers_of(metrics: Accumulator) -> dict[str, Any]:
+    """Return the numbers of an accumulator."""
+    return metrics.compute()
+
+
 @dataclass(frozen=True)
 class Scored:
     """The accumulators of a scored file, one for each scene, in order of their names."""
@@ -55,9 +60,9 @@ class Scored:
         """Return the numbers over all frames."""
         return _merged(list(self.scenes.values())).compute()
 
-    def by_scene(self) -> dict[str, dict[str, Any]]:
-        """Return the numbers of each scene."""
-        return {name: metrics.compute() for name, metrics in self.scenes.items()}
+    def by_scene(self, of_scene: Callable[[Any], dict[str, Any]] = numbers_of) -> dict[str, dict[str, Any]]:
+        """Return the numbers of each scene, as `of_scene` gives them of its accumulator."""
+        return {name: of_scene(metrics) for name, metrics in self.scenes.items()}
 
     def intervals(self, samples: int, *, progress: bool = True) -> dict[str, tuple[float, float]]:
         """Return 95 % percentile bootstrap intervals of the numbers: scenes are drawn with replacement `samples` times.

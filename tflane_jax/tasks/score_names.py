@@ -89,6 +89,10 @@ def score_names(model: HostConfig, example: ExampleConfig, config: EvaluationCon
     names = set(Evaluation("", metrics.compute()).scores())
     if "segments" in model.predicts:  # without matched pairs, there are no errors
         names |= {f"{group}/{name}" for group in metrics.compute() for name in ("AE_type", "AE_dist")}
+    if "lines" in model.predicts:  # without true lines of a class, a part has no AP of it
+        whole = [name.removeprefix("lines") for name in names if name.startswith("lines/") and "/C-" not in name]
+        parts = [group for group in metrics.compute() if group.startswith("lines ") and group != "lines IoU"]
+        names |= {part + name for part in parts for name in whole}
     if example.map_lines is not None and example.map_lines.centerlines == "include":
         names |= {name.replace("/AP_boundary", "/AP_centerline") for name in names if name.startswith("lines")}
     if "centerlines" in model.predicts:  # without lanes, v1.0 is not defined

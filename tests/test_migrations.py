@@ -9,6 +9,8 @@ import pytest
 from tflane_jax.config import RunConfig
 from tflane_jax.config_io import added_settings, first_difference, from_json, to_json
 from tflane_jax.errors import UserError
+from tflane_jax.losses.maptr import MapTrLossConfig
+from tflane_jax.losses.maptrv2 import MapTrV2LossConfig
 from tflane_jax.migrations import (
     migrate,
     moved_setting,
@@ -16,8 +18,12 @@ from tflane_jax.migrations import (
     removed_setting,
     renamed_class,
     renamed_setting,
+    unused_setting,
     value_at,
 )
+from tflane_jax.models.bevformer_detr import BevFormerDetrConfig
+from tflane_jax.models.lanesegnet import LaneSegNetConfig
+from tflane_jax.models.maptr import MapTrConfig
 from tflane_jax.models.marker_fusion import MarkerFusionConfig
 from tflane_jax.models.priors import PriorsConfig
 from tflane_jax.models.sd_map_encoder import SdMapModuleConfig
@@ -44,6 +50,8 @@ OLD = {
         (renamed_setting("Part", "width", "breadth"), "others", [{"class": "Part", "breadth": 4, "range": [0, 9]}]),
         (removed_setting("Part", "range", [0, 9]), "part", {"class": "Part", "width": 3}),
         (removed_setting("Part", "range", lambda root: root["range"]), "others", [{"class": "Part", "width": 4}]),
+        (unused_setting("Part", "range"), "part", {"class": "Part", "width": 3}),
+        (unused_setting("Part", "range"), "others", [{"class": "Part", "width": 4}]),
         (moved_setting("part.width", "width"), "width", 3),
         (moved_setting("range", "part.limits"), "part.limits", [0, 9]),
         (moved_setting("range", "nowhere.limits"), "range", [0, 9]),
@@ -142,6 +150,32 @@ def test_a_reference_batch_that_changed_nothing_is_that_of_the_configuration(sca
     old = to_json(RunConfig())
     old["optim"] |= {"lr_scaling": scaling, "reference_batch": 8}
     assert migrate(old)[0]["optim"]["reference_batch"] == expected
+
+
+@pytest.mark.parametrize("weight", [0.6, 0.9])
+@pytest.mark.parametrize("host", [TopoNetConfig, BevFormerDetrConfig, LaneSegNetConfig])
+def test_the_edge_weight_is_that_of_the_host_with_a_scene_graph(host, weight):
+    """Regression: every lane host had it in its decoder, and only TopoNet read it."""
+    now = to_json(RunConfig(LaneGraphTask(host())))
+    old = copy.deepcopy(now)
+    old["task"]["model"].pop("edge_weight", None)
+    old["task"]["model"]["decoder"]["edge_weight"] = weight
+    read = from_json(RunConfig, migrate(old)[0]).task.model
+    if host is TopoNetConfig:
+        assert read.edge_weight == weight
+    else:
+        assert read == host()
+        assert f"edge_weight no longer exists: its value, {weight}, never had an effect" in migrate(old)[1][0]
+    assert migrate(now) == (now, [])
+
+
+@pytest.mark.parametrize("losses", [MapTrLossConfig(), MapTrV2LossConfig()])
+def test_a_weight_that_no_loss_of_map_lines_read_is_dropped(losses):
+    """Regression: MapTR's losses had a weight of BEV cells, which they do not learn."""
+    old = to_json(RunConfig(LaneGraphTask(MapTrConfig(), losses)))
+    assert "cell_weight" not in old["task"]["losses"]
+    old["task"]["losses"]["cell_weight"] = 0.5
+    assert from_json(RunConfig, migrate(old)[0]).task.losses == losses
 
 
 def test_new_settings_are_listed_with_their_defaults():

@@ -95,6 +95,21 @@ def removed_setting(kind: str, name: str, always: Any, *, instead: str = "") -> 
     return _at_class(kind, remove)
 
 
+def unused_setting(kind: str, name: str) -> Migration:
+    """Return the migration for a setting of class `kind` that nothing read: it is dropped, whatever its value.
+
+    There is a notice, so that nobody believes that it had an effect.
+    """
+
+    def remove(node: Json, path: str, root: Json) -> tuple[Json, list[str]]:
+        if name not in node:
+            return node, []
+        kept = {key: value for key, value in node.items() if key != name}
+        return kept, [f"setting {path}{name} no longer exists: its value, {node[name]}, never had an effect"]
+
+    return _at_class(kind, remove)
+
+
 def moved_setting(old: str, new: str) -> Migration:
     """Return the migration for a setting with another place now; both are dotted names from the top.
 
@@ -193,6 +208,13 @@ def _loss_of_host(root: Json) -> tuple[Json, list[str]]:
     return renamed_class("LaneGraphLossConfig", "BevFormerDetrLossConfig" if of_baseline else "TopoNetLossConfig")(root)
 
 
+def _edge_weight_of_scene_graph(root: Json) -> tuple[Json, list[str]]:
+    """Move the edge weight of the lane decoder to TopoNet, whose scene graph alone read it."""
+    if value_at(root, f"{_MODEL}.class") != "TopoNetConfig":
+        return root, []
+    return moved_setting(f"{_MODEL}.decoder.edge_weight", f"{_MODEL}.edge_weight")(root)
+
+
 def _unused_reference_batch(node: Json, path: str, root: Json) -> tuple[Json, list[str]]:
     """Drop the former default of a setting that changed nothing, because the learning rate was not scaled."""
     unused = node.get("lr_scaling") == "none" and node.get("reference_batch") == 8
@@ -222,4 +244,10 @@ MIGRATIONS: tuple[Migration, ...] = (
     removed_setting("LaneGraphLossConfig", "control_points", lambda root: value_at(root, f"{_MODEL}.control_points")),
     _loss_of_host,
     _at_class("OptimConfig", _unused_reference_batch),
+    # Settings belong to the classes that read them.
+    _edge_weight_of_scene_graph,
+    unused_setting("LaneDecoderConfig", "edge_weight"),
+    unused_setting("SegmentDecoderConfig", "edge_weight"),
+    unused_setting("MapTrLossConfig", "cell_weight"),
+    unused_setting("MapTrV2LossConfig", "cell_weight"),
 )

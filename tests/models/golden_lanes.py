@@ -12,7 +12,7 @@ from tflane_jax.scene import LaneGraph, stack_examples
 
 
 def decoder_config(case):
-    sizes = options(case, "dim", "heads", "layers", "queries", "lane_points", "hidden", points=4, edge_weight=0.6)
+    sizes = options(case, "dim", "heads", "layers", "queries", "lane_points", "hidden", points=4)
     # Channels of a relationship head's sides; the baseline's fixture has no such head.
     hidden = numbered(case.params, r"lclc_branches\.0\.MLP_o1\.layers\.(\d+)\.bias")
     return LaneDecoderConfig(
@@ -23,7 +23,6 @@ def decoder_config(case):
         points=sizes.lane_points,
         sampling_points=sizes.points,
         hidden=sizes.hidden,
-        edge_weight=sizes.edge_weight,
         relation=len(case.params[hidden[-1]]) if hidden else 128,
         refine="fixed",
     )

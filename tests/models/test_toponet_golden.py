@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.converted import converted_params
-from tests.golden import case_id, golden_modules, load_module_case
+from tests.golden import case_id, golden_modules, load_module_case, options
 from tests.golden_compare import assert_outputs_close
 from tests.models.golden_lanes import (
     bev_maps,
@@ -51,7 +51,8 @@ def test_lane_head_matches_the_reference(path):
 
 def check_head(case):
     decoder, weights = decoder_config(case), TopoNetLossConfig()
-    module = TopoNet(TopoNetConfig(encoder=encoder_config(case), decoder=decoder))
+    edge_weight = options(case, edge_weight=0.6).edge_weight
+    module = TopoNet(TopoNetConfig(encoder=encoder_config(case), decoder=decoder, edge_weight=edge_weight))
     lanes = truth(case)
     elements, found = element_truth(case, lanes.valid.shape[1])
 

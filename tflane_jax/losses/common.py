@@ -11,7 +11,6 @@ import optax
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from tflane_jax.limits import PositiveOrZero
 from tflane_jax.matching import Assignment
 from tflane_jax.models.auxiliary import AuxiliaryOutputs
 from tflane_jax.scene import Example, Prediction
@@ -26,13 +25,7 @@ ClassMean = Literal["frame", "batch"]
 
 @dataclass(frozen=True)
 class HostLossConfig:
-    """Weights of a host's loss; every host derives its own class, in its own file.
-
-    Attributes:
-        cell_weight: weight of the auxiliary loss on BEV cells, if the host has it (`losses.lane_cells`).
-    """
-
-    cell_weight: PositiveOrZero = 1.0
+    """Weights of a host's loss; every host derives its own class, in its own file."""
 
     open_base: ClassVar[bool] = True
     """Settings of this type accept any subclass, see `config_io.subclasses`."""

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float
 
-from tflane_jax.limits import Fraction, PositiveOrZero
+from tflane_jax.limits import PositiveOrZero
 from tflane_jax.losses.areas import AreaLossConfig, area_loss
 from tflane_jax.losses.auxiliary import auxiliary_losses, denoising_pairs
 from tflane_jax.losses.common import (
@@ -33,10 +33,10 @@ from tflane_jax.losses.common import (
     total,
 )
 from tflane_jax.losses.costs import dice_cost, focal_cost, mask_cost, pairwise_l1
+from tflane_jax.losses.lane_weights import LaneWeights
 from tflane_jax.losses.segment_masks import Raster, segment_masks
 from tflane_jax.losses.toponet import lane_quality
 from tflane_jax.losses.traffic_elements import (
-    ElementLossConfig,
     assign_elements,
     clear_padding,
     element_losses,
@@ -56,49 +56,28 @@ from tflane_jax.scene import ElementPrediction, Example, Prediction, SegmentPred
 
 
 @dataclass(frozen=True)
-class LaneSegNetLossConfig(HostLossConfig):
+class LaneSegNetLossConfig(LaneWeights, HostLossConfig):
     """Weights of matching costs and loss terms; the defaults are LaneSegNet's.
 
     Attributes:
-        class_weight, points_weight: of both cost and loss; points of all three lines in metres, summed over
-            coordinates.
         mask_weight, dice_weight: of both cost and loss.
         type_weight: of the line types of either boundary.
-        successor_weight: of the topology.
-        alpha, gamma: parameters of every focal term.
-        matcher: backend of `matching.match`.
         dice_cost: the dice cost takes the masks' "logits", as the published configuration does, or their
             "probabilities", as the dice loss does.
-        element_lane_weight: of the topology with traffic elements, whose loss is that of the successors.
         successor_mean: of both topologies: the sum over matched pairs is divided by the number of "negatives", the
             pairs without an edge, as in the published code, or of all "pairs".
         raster: of the mask targets.
-        class_target: of a query matched with a segment: "one", or "quality" (`segment_quality`).
-        class_mean: the losses of classes and line types are divided by the matched rows, and those of both topologies
-            by the pairs, of each "frame", as in the published training, or of the "batch", see
-            `losses.common.over_matched`.
-        proposal_weight: of the heat map of proposals; their shapes have `points_weight`.
-        elements, areas: weights of traffic elements and of areas, where the model predicts them.
-        cell_weight: see `HostLossConfig`.
+        areas: weights of areas, where the model predicts them.
+        others: see `LaneWeights`. Points are those of all three lines. The loss of both topologies is that of the
+            published code; `class_mean` holds for line types, and for the pairs of both topologies, too.
     """
 
-    class_weight: PositiveOrZero = 1.5
-    points_weight: PositiveOrZero = 0.025
     mask_weight: PositiveOrZero = 3.0
     dice_weight: PositiveOrZero = 3.0
     type_weight: PositiveOrZero = 0.1
-    successor_weight: PositiveOrZero = 5.0
-    element_lane_weight: PositiveOrZero = 5.0
-    alpha: Fraction = 0.25
-    gamma: PositiveOrZero = 2.0
-    matcher: Literal["scipy", "jax"] = "jax"
     dice_cost: Literal["logits", "probabilities"] = "logits"
     successor_mean: Literal["negatives", "pairs"] = "negatives"
     raster: Raster = "cells"
-    class_target: Literal["one", "quality"] = "one"
-    class_mean: ClassMean = "batch"
-    proposal_weight: PositiveOrZero = 1.5
-    elements: ElementLossConfig = ElementLossConfig()
     areas: AreaLossConfig = AreaLossConfig()
 
     def loss(

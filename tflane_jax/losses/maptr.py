@@ -53,7 +53,6 @@ class MapTrLossConfig(HostLossConfig):
             for truth whose rings turn either way.
         matcher: backend of `matching.match`.
         class_target: of a query matched with a line: "one", or "quality" (`line_quality`).
-        cell_weight: not used.
     """
 
     class_weight: PositiveOrZero = 2.0

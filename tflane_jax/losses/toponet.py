@@ -9,17 +9,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Literal
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from tflane_jax.geometry.bezier import bezier_fit
-from tflane_jax.limits import Fraction, PositiveOrZero
 from tflane_jax.losses.auxiliary import auxiliary_losses, denoising_pairs
 from tflane_jax.losses.common import (
-    ClassMean,
     HostLossConfig,
     Report,
     Terms,
@@ -32,8 +30,8 @@ from tflane_jax.losses.common import (
     total,
 )
 from tflane_jax.losses.costs import focal_cost, pairwise_l1
+from tflane_jax.losses.lane_weights import LaneWeights
 from tflane_jax.losses.traffic_elements import (
-    ElementLossConfig,
     assign_elements,
     clear_padding,
     element_losses,
@@ -52,34 +50,8 @@ from tflane_jax.scene import (
 
 
 @dataclass(frozen=True)
-class TopoNetLossConfig(HostLossConfig):
-    """Weights of matching costs and loss terms; the defaults are TopoNet's.
-
-    Attributes:
-        class_weight, points_weight: of both cost and loss; points in metres, summed over coordinates.
-        successor_weight, element_lane_weight: of the topology losses, means over all pairs of queries.
-        alpha, gamma: parameters of every focal term.
-        matcher: backend of `matching.match`.
-        elements: weights for traffic elements.
-        class_target: of a query matched with a lane: "one", or "quality", which falls with its distance from the lane
-            (`lane_quality`), so that scores rank lanes by their precision (Li et al. 2020, quality focal loss).
-        class_mean: the class loss is divided by the matched lanes of each "frame", as in the published training, or of
-            the "batch", see `losses.common.over_matched`.
-        proposal_weight: of the heat map of lane proposals; their shapes have `points_weight`.
-        cell_weight: see `HostLossConfig`.
-    """
-
-    class_weight: PositiveOrZero = 1.5
-    points_weight: PositiveOrZero = 0.025
-    successor_weight: PositiveOrZero = 5.0
-    alpha: Fraction = 0.25
-    gamma: PositiveOrZero = 2.0
-    matcher: Literal["scipy", "jax"] = "jax"
-    element_lane_weight: PositiveOrZero = 5.0
-    elements: ElementLossConfig = ElementLossConfig()
-    class_target: Literal["one", "quality"] = "one"
-    class_mean: ClassMean = "batch"
-    proposal_weight: PositiveOrZero = 1.5
+class TopoNetLossConfig(LaneWeights, HostLossConfig):
+    """Weights, see `LaneWeights`; the defaults are TopoNet's. Topology losses are means over all pairs of queries."""
 
     def loss(
         self, outputs: Prediction, auxiliary: AuxiliaryOutputs, batch: Example, host: Any

@@ -58,7 +58,7 @@ class LaneDecoderLayer(nn.Module):
     Attributes:
         config: sizes.
         initial: initial sampling offsets, see `DeformableAttention`.
-        edge_weight: of the scene graph, see `LaneDecoderConfig`.
+        edge_weight: of the scene graph, see `TopoNetConfig`.
     """
 
     config: LayerSizes

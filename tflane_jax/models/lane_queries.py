@@ -48,7 +48,6 @@ class LaneDecoderConfig:
         sampling_points: deformable sampling points per head.
         hidden: channels inside the feed-forward block.
         relation: channels of each partner in the relationship head.
-        edge_weight: weight of neighbours in the scene graph.
         bands: frequencies per coordinate in the position encoding of a refined lane.
         refine: see `models.lane_decoder`.
         output: "sigmoid" adds the change of a lane to the logit of its reference, as in Deformable DETR. "metric" adds
@@ -69,7 +68,6 @@ class LaneDecoderConfig:
     sampling_points: Count = 4
     hidden: Count = 128
     relation: Count = 16
-    edge_weight: PositiveOrZero = 0.6
     bands: Count = 6
     refine: Literal["fixed", "iterative"] = "iterative"
     output: Literal["sigmoid", "metric"] = "sigmoid"

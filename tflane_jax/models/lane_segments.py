@@ -39,7 +39,6 @@ class SegmentDecoderConfig(LaneDecoderConfig):
             and across the centerline at each point, smooth along the lane, starting 1.75 m to either side.
         classes: 2: lane segment and crossing; 1: lane segment, where areas have a decoder of their own.
         initial_score: initial probability of the classes; None: PyTorch's initial biases, as in LaneSegNet.
-        edge_weight: not used, there is no scene graph.
         others: see `LaneDecoderConfig`; `sampling_points` is a multiple of 8 or less than 8, `heads` is even.
     """
 

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 
 from tflane_jax.layers.graph import ElementNodes, edge_probabilities
 from tflane_jax.layers.precision import run_layer
-from tflane_jax.limits import Rules, check_settings
+from tflane_jax.limits import PositiveOrZero, Rules, check_settings
 from tflane_jax.models.auxiliary import AuxiliaryName
 from tflane_jax.models.camera_encoder import PAPER_CAMERA_ENCODER
 from tflane_jax.models.element_decoder import PAPER_ELEMENT_DECODER, ElementOutput
@@ -45,11 +45,13 @@ class TopoNetConfig(HostConfig):
 
     Attributes:
         decoder: lane decoder.
+        edge_weight: weight of neighbours in the scene graph.
         denoising: noised lanes in training (`models.lane_denoising`); None as in the paper.
         encoder, range, priors, elements: see `HostConfig`; elements need as many layers as the decoder.
     """
 
     decoder: LaneDecoderConfig = LaneDecoderConfig()
+    edge_weight: PositiveOrZero = 0.6
     denoising: DenoisingConfig | None = None
 
     @property
@@ -124,7 +126,7 @@ class TopoNet(Host):
                 embed = ElementEmbedding(config, name=f"element_embedding_{i}")
                 embedded = embed(elements.queries[i], deterministic=deterministic)
                 nodes = ElementNodes(embedded, elements.logits[i], element_edges)
-            layer = partial(LaneDecoderLayer, config, edge_weight=config.edge_weight, name=f"layer_{i}")
+            layer = partial(LaneDecoderLayer, config, edge_weight=self.config.edge_weight, name=f"layer_{i}")
             inputs = queries, placed, attention_reference(reference, config), bev, adjacency, nodes
             queries = run_layer(self, layer, config, *inputs, deterministic=deterministic)
             self.sow("intermediates", "layer_queries", queries)

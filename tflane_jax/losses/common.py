@@ -34,6 +34,7 @@ class HostLossConfig:
 
     cell_weight: PositiveOrZero = 1.0
 
+    abstract_base: ClassVar[bool] = True
     open_base: ClassVar[bool] = True
     """Settings of this type accept any subclass, see `config_io.subclasses`."""
 

@@ -12,7 +12,7 @@ from tests.shared import ROOT
 # From the ground up. A file imports from its own package and from the lines above its own, never from its own line.
 FLOORS = (
     "errors",
-    "limits accelerators memory",
+    "limits accelerators memory own_modules",
     "config_io config_files migrations processes progress startup child_processes",
     "devices",
     "geometry",

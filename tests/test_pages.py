@@ -8,9 +8,12 @@ from types import SimpleNamespace
 from typing import Any
 
 import jax
+import numpy as np
 import pytest
 
+from tests.models.cases import BASELINE, make_example
 from tests.models.toy_host import ToyHostConfig, ToyHostLossConfig
+from tests.parameters import random_params
 from tests.shared import ROOT
 from tests.training.stub import LineDataset, LineTask, line_arrays
 from tflane_jax.cli import build_parser
@@ -20,6 +23,8 @@ from tflane_jax.datasets import sources
 from tflane_jax.errors import UserError
 from tflane_jax.layers.batch_norm import STATISTICS
 from tflane_jax.runs import check_origin
+from tflane_jax.scene import stack_examples
+from tflane_jax.tasks.lane_graph import LaneGraphTask
 
 PAGES = {
     path.relative_to(ROOT).as_posix(): path.read_text("utf-8")
@@ -136,3 +141,38 @@ def test_the_training_loop_of_the_page_trains(monkeypatch):
     before, after = (float(task.loss(params, line_arrays(), jax.random.key(0))[0]) for params in (start, end))
     assert after < before
     assert (end[STATISTICS]["mean"] != start[STATISTICS]["mean"]).all()
+
+
+def python_blocks(page: str, word: str) -> list[str]:
+    """Return the blocks of Python of a page that contain a word."""
+    blocks = re.findall(r"^```python\n(.*?)^```", PAGES[page], re.DOTALL | re.MULTILINE)
+    return [block for block in blocks if word in block]
+
+
+def test_the_own_metric_of_the_page_runs(monkeypatch, capsys):
+    (code,) = python_blocks("docs/predictions.md", "differences")
+    task = LaneGraphTask(BASELINE)
+    example = make_example(0)
+    run = SimpleNamespace(task=task, data=SimpleNamespace(source=lambda split: split))
+    opened = SimpleNamespace(config=run, params=[random_params(task.init, example)])
+    monkeypatch.setattr("tflane_jax.runs.open_run", lambda folder: opened)
+    monkeypatch.setattr(sources, "load", lambda split: stack_examples([example, make_example(1), make_example(2)]))
+    names: dict[str, Any] = {}
+    exec(compile(code, "predictions.md", "exec"), names)
+    assert len(names["differences"]) == 3
+    assert capsys.readouterr().out.startswith("mean difference of the number of lanes ")
+
+
+def test_the_examples_of_the_page_are_valid():
+    names: dict[str, Any] = {}
+    code, of_a_log = python_blocks("docs/your_data.md", "example")
+    exec(compile(code, "your_data.md", "exec"), names)
+    arrays = names["example"]
+    exec(compile(of_a_log, "your_data.md", "exec"), names)
+    made = names["example"]
+    made.validate()
+    for name in ("bev", "traffic_flow", "lanes", "segments", "areas"):
+        assert jax.tree.map(np.shape, getattr(arrays, name)) == jax.tree.map(np.shape, getattr(made, name)), name
+    assert (arrays.lanes.valid.sum(), made.lanes.valid.sum()) == (2, 1)
+    for example in (arrays, made):
+        assert example.traffic_flow.valid.any(1).sum() == 1

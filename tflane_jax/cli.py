@@ -23,6 +23,7 @@ from tflane_jax.commands.arguments import comparisons, data, markers, models
 from tflane_jax.commands.arguments.shared import CommandParser
 from tflane_jax.errors import Interrupted, UserError
 from tflane_jax.memory import keep_freed_memory
+from tflane_jax.own_modules import add_imports, import_own, look_in, take_imports
 from tflane_jax.startup import leave
 
 _AGAIN_SECONDS = 0.1
@@ -33,8 +34,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     keep_freed_memory()
     if arguments is None:  # the program itself
         warnings.showwarning = OneLineWarnings(warnings.showwarning)
+    modules, others = take_imports(sys.argv[1:] if arguments is None else arguments)
+    try:
+        add_imports(modules)
+        look_in(None)
+        import_own()  # before names of own datasets are read
+    except UserError as error:
+        print(f"tflane: {error}", file=sys.stderr)
+        return 2
     parser = build_parser()
-    options, rest = parser.parse_known_args(arguments)
+    options, rest = parser.parse_known_args(others)
     if rest and not options.takes_overrides:
         parser.error(f"unknown argument {rest[0]}: see tflane {options.command} --help")
     with _ending_on_sigterm(), _signals_not_lost():

@@ -9,7 +9,6 @@ import ast
 import contextlib
 import dataclasses
 import difflib
-import importlib.util
 import re
 import traceback
 from collections.abc import Sequence
@@ -17,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
-from tflane_jax.config_files import find_config, split_reference
+from tflane_jax.config_files import find_config, is_shipped, split_reference
 from tflane_jax.config_io import part_classes
 from tflane_jax.datasets.argoverse2 import LogData
 from tflane_jax.datasets.front_views import FrontViewData
@@ -27,13 +26,14 @@ from tflane_jax.datasets.openlane_v2 import OpenLaneV2Data
 from tflane_jax.datasets.procedural import WorldData
 from tflane_jax.datasets.real_maps import RealMapData
 from tflane_jax.datasets.recorded_logs import RecordedData
-from tflane_jax.datasets.sources import data_classes
+from tflane_jax.datasets.sources import data_classes, when_added
 from tflane_jax.datasets.tusimple import TuSimpleData
 from tflane_jax.errors import UserError
 from tflane_jax.evaluation.results import EvaluationConfig
 from tflane_jax.layers.precision import Precision
-from tflane_jax.limits import Rules, SettingError, check_settings
+from tflane_jax.limits import Rules, SettingError, check_settings, forget_types
 from tflane_jax.models.camera_encoder import CameraEncoderConfig
+from tflane_jax.own_modules import import_file
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.tasks.lane_shape import LaneShapeTask
 from tflane_jax.training.loop import TrainingConfig
@@ -44,6 +44,13 @@ if TYPE_CHECKING:
     from tflane_jax.datasets.data_source import SplitData as Data
 else:
     Data = data_classes()  # at runtime, the union of all data classes, for JSON and overrides
+
+    @when_added
+    def _take_added_classes() -> None:
+        globals()["Data"] = data_classes()
+        forget_types()
+
+
 T = TypeVar("T")
 # Configuration files import data classes from here or from their dataset's file.
 __all__ = [
@@ -173,12 +180,10 @@ def with_restarts(config: RunConfig, *, cycles: int = 3) -> RunConfig:
 
 def _run_function(path: Path, function: str, kind: type[T]) -> T:
     """Run a config file and return the result of one of its functions."""
-    spec = importlib.util.spec_from_file_location(f"tflane_config_{path.stem}", path)
-    if spec is None or spec.loader is None:
+    if path.suffix != ".py":
         raise UserError(f"config file {path} is no Python file (.py)")
-    module = importlib.util.module_from_spec(spec)
     with _named_errors(path):
-        spec.loader.exec_module(module)
+        module = import_file(path, beside=not is_shipped(path))
     if not hasattr(module, function):
         raise UserError(f"config file {path} has no function {function}()")
     with _named_errors(path):
@@ -193,7 +198,7 @@ def _named_errors(path: Path):
     try:
         yield
     except Exception as error:
-        own = str(path.absolute())  # the import system makes names absolute
+        own = str(path.resolve())  # as `import_file` does
         lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == own]
         line = error.lineno if isinstance(error, SyntaxError) else lines[-1] if lines else "?"
         if (
@@ -211,7 +216,8 @@ def _checked(path: Path, config: RunConfig) -> RunConfig:
     try:
         check_settings(config)
     except SettingError as error:
-        raise UserError(f"config file {path}{_lines_of(path, error)}: {error}") from error
+        own = "; an own dataset is added by datasets.sources.add_source" if error.setting == "data" else ""
+        raise UserError(f"config file {path}{_lines_of(path, error)}: {error}{own}") from error
     return config
 
 

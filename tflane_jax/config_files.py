@@ -35,6 +35,11 @@ def shipped_configs() -> dict[str, Path]:
     return {path.relative_to(folder).with_suffix("").as_posix(): path for path in paths}
 
 
+def is_shipped(path: Path) -> bool:
+    """Return whether a file is one of the package's configurations."""
+    return any(path.resolve().is_relative_to(folder) for folder in _FOLDERS)
+
+
 def find_config(name: str) -> Path:
     """Return the file of a configuration: an existing file first, else the shipped one of that name.
 

@@ -1,6 +1,7 @@
 """Configurations (trees of frozen dataclasses) as text, as JSON, and back from JSON.
 
-Reading follows the type hints of the expected classes, so that a file can choose settings but never run code.
+Reading follows the type hints of the expected classes, so that a file can choose settings but never run code. Classes
+of the user are found if their modules are imported, see `own_modules`.
 Configurations of older versions go through `migrations.migrate` first.
 """
 
@@ -12,13 +13,15 @@ import enum
 import importlib
 import json
 import pkgutil
+import sys
 import types
 import typing
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeGuard, TypeVar
 
 from tflane_jax.errors import UserError
+from tflane_jax.own_modules import VARIABLE, import_own
 
 T = TypeVar("T")
 
@@ -62,27 +65,49 @@ def from_json(kind: type[T], content: Any) -> T:
     Settings that the file lacks take their defaults, so that runs of an older version can be read.
 
     Raises:
-        UserError: names the setting that this version does not know or cannot read.
+        UserError: names the setting that this version does not know or cannot read, or a module of TFLANE_IMPORT that
+            cannot be imported.
     """
+    import_own()
     return _dataclass(kind, content, "")
 
 
 def subclasses(kind: type) -> dict[str, type]:
     """Return `kind` and the dataclasses derived from it, by class name.
 
-    For an open base class (`HostConfig`, `HostLossConfig`), all modules of its package are imported first, so that
-    every shipped subclass is found. Subclasses of other packages are found if they are imported already.
+    For an abstract base class (`HostConfig`, `HostLossConfig`), all modules of its package are imported first, so that
+    every shipped subclass is found. Subclasses of other packages are found if they are imported already; of several
+    with one name, the latest.
+
+    Raises:
+        UserError: an own class has the name of a shipped one.
     """
-    if kind.__module__.startswith("tflane_jax.") and getattr(kind, "open_base", False):
+    if _is_abstract(kind):
         package = importlib.import_module(kind.__module__.rpartition(".")[0])
         for module in pkgutil.iter_modules(package.__path__):
             importlib.import_module(f"{package.__name__}.{module.name}")
     found, waiting = {}, [kind]
     while waiting:
         each = waiting.pop(0)
-        waiting += each.__subclasses__()
-        found.setdefault(each.__name__, each)
+        waiting += [c for c in each.__subclasses__() if c.__module__ in sys.modules]  # others: the import has failed
+        shipped = found.get(each.__name__)
+        if shipped is not None and shipped.__module__.startswith("tflane_jax."):
+            raise UserError(
+                f"class {each.__name__} of {each.__module__} is called like one of tflane_jax: give it another name, "
+                "because runs are read back by it"
+            )
+        found[each.__name__] = each
     return found
+
+
+def _is_open(kind: Any) -> TypeGuard[type]:
+    """Return whether a setting of this type accepts subclasses."""
+    return isinstance(kind, type) and dataclasses.is_dataclass(kind) and getattr(kind, "open_base", False)
+
+
+def _is_abstract(kind: type) -> bool:
+    """Return whether a class only stands for its subclasses."""
+    return vars(kind).get("abstract_base", False)
 
 
 def part_classes(kind: type) -> dict[str, type]:
@@ -95,7 +120,7 @@ def part_classes(kind: type) -> dict[str, type]:
         if isinstance(hint, type) and dataclasses.is_dataclass(hint) and hint.__name__ not in found:
             found[hint.__name__] = hint
             waiting += typing.get_type_hints(hint).values()
-            waiting += subclasses(hint).values() if getattr(hint, "open_base", False) else ()
+            waiting += subclasses(hint).values() if _is_open(hint) else ()
     return found
 
 
@@ -131,10 +156,12 @@ def _shown(value: Any) -> str:
 
 
 def _dataclass(kind: Any, content: Any, path: str) -> Any:
-    if isinstance(content, dict) and getattr(kind, "open_base", False):
+    if isinstance(content, dict) and _is_open(kind):
+        _check_known(content, path.removesuffix("."))
         kind = subclasses(kind).get(str(content.get("class", "")), kind)
     if not isinstance(content, dict) or content.get("class") != kind.__name__:
-        raise UserError(f"setting {path or 'at the top'} should be a {kind.__name__}, not {content!r:.80}")
+        name = path.removesuffix(".") or "at the top"
+        raise UserError(f"setting {name} should be a {kind.__name__}, not {content!r:.80}")
     hints = typing.get_type_hints(kind)
     names = {field.name for field in dataclasses.fields(kind)}
     unknown = sorted(content.keys() - names - {"class"})
@@ -147,6 +174,17 @@ def _dataclass(kind: Any, content: Any, path: str) -> Any:
     if missing:
         raise UserError(f"setting {path}{missing[0]} is missing")
     return kind(**values)
+
+
+def _check_known(content: dict[str, Any], name: str) -> None:
+    """Raise UserError for the content of a setting whose class no imported module has."""
+    kind = content.get("class")
+    if not isinstance(kind, str) or any(kind in vars(module) for module in list(sys.modules.values())):
+        return
+    raise UserError(
+        f"class {kind} (setting {name}) is not part of tflane_jax: import its module first "
+        f"(--import MODULE or {VARIABLE})"
+    )
 
 
 def _is_required(field: dataclasses.Field[Any]) -> bool:
@@ -190,9 +228,14 @@ def choices(config: Any, name: str) -> dict[str, Any]:
         config = getattr(config, part, None)
     hint = typing.get_type_hints(type(config)).get(field) if dataclasses.is_dataclass(config) else None
     kinds = typing.get_args(hint) if typing.get_origin(hint) in (typing.Union, types.UnionType) else ()
-    named = {kind.__name__: kind for kind in kinds if isinstance(kind, type) and dataclasses.is_dataclass(kind)}
-    if isinstance(hint, type) and getattr(hint, "open_base", False):
-        named = {name: kind for name, kind in subclasses(hint).items() if kind is not hint}
+    named: dict[str, Any] = {}
+    for kind in kinds or (hint,):
+        if _is_open(kind):
+            named |= {name: each for name, each in subclasses(kind).items() if not _is_abstract(each)}
+        elif kinds and isinstance(kind, type) and dataclasses.is_dataclass(kind):
+            named[kind.__name__] = kind
+    if not kinds and len(named) == 1:
+        return {}
     if named and type(None) in kinds:
         return {"None": type(None), "default": next(iter(named.values())), **named}
     return named
@@ -210,9 +253,12 @@ def _member(kinds: tuple[Any, ...], content: Any, path: str) -> Any:
     if content is None and type(None) in kinds:
         return None
     if isinstance(content, dict):
-        named = [k for k in kinds if dataclasses.is_dataclass(k) and getattr(k, "__name__", "") == content.get("class")]
-        if named:
-            return _dataclass(named[0], content, f"{path}.")
+        for kind in kinds:
+            known = subclasses(kind) if _is_open(kind) else {getattr(kind, "__name__", ""): kind}
+            if dataclasses.is_dataclass(kind) and content.get("class") in known:
+                return _dataclass(kind, content, f"{path}.")
+        if any(map(dataclasses.is_dataclass, kinds)):
+            _check_known(content, path)
     for kind in kinds:
         if not dataclasses.is_dataclass(kind) and kind is not type(None):
             try:

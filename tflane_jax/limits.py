@@ -171,6 +171,11 @@ def _dataclasses(name: str, value: Any) -> Iterator[tuple[str, Any]]:
             yield from _dataclasses(f"{name}[{index}]", item)
 
 
+def forget_types() -> None:
+    """Look at the types of settings again, because a union of classes has got another member."""
+    _hints.cache_clear()
+
+
 @functools.cache
 def _hints(kind: type) -> dict[str, Any]:
     return typing.get_type_hints(kind, include_extras=True)

@@ -8,7 +8,10 @@ import pytest
 
 from tests.convert.lstr_state import TINY, lstr_state
 from tests.shared import shared_path
+from tflane_jax.commands.convert import convert
+from tflane_jax.config import load_config
 from tflane_jax.convert.lstr import load_lstr
+from tflane_jax.convert.published import load_weights
 from tflane_jax.convert.torch_file import read_state_dict
 from tflane_jax.convert.weights_files import PUBLISHED, digest_of, find_weights
 from tflane_jax.errors import UserError
@@ -78,3 +81,23 @@ def test_the_digest_is_that_of_the_weights():
 @pytest.mark.golden
 def test_the_published_file_has_its_digest():
     assert digest_of(read_state_dict(shared_path("data/lstr/LSTR_500000.npz"))) == LSTR.digest
+
+
+def test_names_of_published_weights_are_listed(folders):
+    with pytest.raises(UserError, match=r"^lstrr is neither a file of weights nor a name of published ones, .* lstr$"):
+        find_weights(Path("lstrr"))
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("lstr", r"the published weights lstr are of gtn_lane models \(--config gtn_lane/lstr\)"),
+        ("toponet", "toponet is neither a file of weights nor a name of published ones, which are lstr"),
+    ],
+)
+def test_models_of_lane_graphs_have_no_published_weights_by_name(name, message, folders, tmp_path):
+    (folders[0] / LSTR.files[0]).touch()
+    with pytest.raises(UserError, match=message):
+        convert("tf_lane/toponet", tmp_path / "run", Path(name))
+    with pytest.raises(UserError, match=message):
+        load_weights(Path(name), load_config("tf_lane/toponet").task)

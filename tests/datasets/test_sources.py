@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.datasets import toy_source
 from tests.shared import ROOT
 from tflane_jax.cli import build_parser, main
 from tflane_jax.commands.sources import chosen_source
@@ -21,7 +22,10 @@ from tflane_jax.config import (
     SceneFileData,
     TuSimpleData,
     WorldData,
+    load_config,
 )
+from tflane_jax.config_io import from_json, to_json
+from tflane_jax.config_overrides import apply_overrides
 from tflane_jax.datasets import sources
 from tflane_jax.datasets.argoverse2 import Argoverse2Config
 from tflane_jax.datasets.base import SPLITS
@@ -36,6 +40,7 @@ from tflane_jax.datasets.streaming import StreamingConfig
 from tflane_jax.datasets.tusimple import TuSimpleConfig
 from tflane_jax.datasets.view_images import TOPONET_SUBSET_B
 from tflane_jax.errors import UserError
+from tflane_jax.limits import SettingError, check_settings
 from tflane_jax.scene import Example, RoadImage
 from tflane_jax.tasks.lane_shape import LaneShapeTask
 from tflane_jax.world.cameras.ring import CameraRigConfig
@@ -79,7 +84,7 @@ def test_every_source_has_its_own_name_and_one_config():
         assert same == {source.config: source.data}
     with pytest.raises(UserError, match="no data source toys, only procedural, "):
         sources.named_source("toys")
-    with pytest.raises(TypeError, match="config of no data source"):
+    with pytest.raises(TypeError, match=r"config of no data source: add its source by datasets\.sources\.add_source"):
         sources.open_dataset(RunConfig())
 
 
@@ -259,3 +264,44 @@ def test_tusimples_folder_is_checked(tmp_path, capsys):
     shutil.copy(tmp_path / "label_data_0531.json", tmp_path / "test_label.json")
     assert main(["data", "check", "--format", "tusimple", str(tmp_path)]) == 0
     assert "| train |      2 |           2 |" in capsys.readouterr().out
+
+
+@pytest.fixture
+def unchanged():
+    """Forget the sources that a test adds."""
+    before = list(sources.SOURCES)
+    yield
+    sources.SOURCES[:] = before
+    for tell in sources._told:
+        tell()
+
+
+@pytest.mark.usefixtures("unchanged")
+def test_a_dataset_is_added_from_outside(tmp_path):
+    """After a configuration was checked, so that its types are known already."""
+    own = RunConfig(data=toy_source.ToyData(tmp_path))
+    with pytest.raises(SettingError, match=r"data is ToyData.*: it must be WorldData or"):
+        check_settings(own)
+    path = tmp_path / "own.py"
+    path.write_text(
+        "from pathlib import Path\nfrom tests.datasets.toy_source import ToyData\n"
+        "from tflane_jax.config import RunConfig\n\n\n"
+        "def get_config():\n    return RunConfig(data=ToyData(Path('x')))\n"
+    )
+    with pytest.raises(UserError, match=r"own\.py, line 7: data is .*an own dataset is added by datasets\.sources"):
+        load_config(str(path))
+    with pytest.raises(UserError, match=r"no data source toy, .*; an own one is added by datasets\.sources"):
+        sources.named_source("toy")
+    for _ in range(2):  # as a notebook's cell that runs again
+        sources.add_source(toy_source.SOURCE)
+    assert sources.source_names()[-1] == "toy"
+    assert sources.source_names().count("toy") == 1
+    check_settings(own)
+    assert load_config(str(path)).data == toy_source.ToyData(Path("x"))
+    assert from_json(RunConfig, json.loads(json.dumps(to_json(own)))) == own
+    assert apply_overrides(own, ["--data.root", "elsewhere"]).data == toy_source.ToyData(Path("elsewhere"))
+    (tmp_path / "test.txt").write_text("3")
+    assert len(sources.open_dataset(own.data.source("test"))) == 3
+    assert main(["data", "check", "--format", "toy", str(tmp_path)]) == 2  # there are no other splits
+    with pytest.raises(ValueError, match=r"tflane_jax has a data source tusimple \(TuSimpleData\): choose other names"):
+        sources.add_source(replace(toy_source.SOURCE, name="tusimple"))

@@ -1,5 +1,7 @@
 """Masks against the truth table of each pair, and the spatial mask against its definition entry by entry."""
 
+import re
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -184,3 +186,11 @@ def test_each_group_of_lanes_has_its_copy_of_the_instances():
 def test_a_frame_sees_itself_and_earlier_ones(frames):
     expected = [[j <= i for j in range(frames)] for i in range(frames)]
     assert np.asarray(causal_mask(frames)).tolist() == expected
+
+
+@pytest.mark.parametrize("shape", [(3, 3), (1, 3), (4, 2), (2, 3, 3)])
+def test_a_restriction_is_of_all_lanes_and_instances(shape):
+    mask = SpatialMask.from_validity(4, jnp.ones(3, bool))
+    wanted = re.escape(f"pairs have shape {shape}, expected ([H,] L, T) = ([H,] 4, 3)")
+    with pytest.raises(ValueError, match=wanted):
+        mask.restricted(jnp.ones(shape, bool))

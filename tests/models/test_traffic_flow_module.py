@@ -14,10 +14,11 @@ from tests.priors.test_traffic_flow import make_flow
 from tests.shared import ROOT
 from tflane_jax.geometry import BevGrid, PerceptionRange
 from tflane_jax.layers.masks import SpatialMask
-from tflane_jax.models.prior import HostSpec
+from tflane_jax.models.prior import HostQueries, HostSpec
 from tflane_jax.models.traffic_flow_module import (
     ALL_FUSIONS,
     LANE_FUSIONS,
+    EncodedTrafficFlow,
     SpatialEncoder,
     TemporalEncoder,
     TrafficFlowConfig,
@@ -213,7 +214,8 @@ def test_gradient_against_finite_differences():
 
 
 def test_the_example_of_a_model_of_ones_own_reads_traffic():
-    (code,) = re.findall(r"^```python\n(.*?)^```", (ROOT / "docs/your_data.md").read_text("utf-8"), re.DOTALL | re.M)
+    page = (ROOT / "docs/your_data.md").read_text("utf-8")
+    (code,) = [part for part in re.findall(r"^```python\n(.*?)^```", page, re.DOTALL | re.M) if "WithTraffic" in part]
     names: dict = {}
     exec(compile(code, "your_data.md", "exec"), names)
     rng = np.random.default_rng(0)
@@ -226,3 +228,17 @@ def test_the_example_of_a_model_of_ones_own_reads_traffic():
     outputs = [np.asarray(apply(model, params, flow, queries, queries, lines)) for flow in (some, other)]
     assert outputs[0].shape == (LANES, 64)
     assert np.abs(outputs[0] - outputs[1]).max() > 1e-3
+
+
+@pytest.mark.parametrize("wrong", ["features", "position"])
+def test_queries_of_other_channels_than_the_host_says_are_named(wrong):
+    spec = HostSpec(DIM, PerceptionRange(), BevGrid().range)
+    prior = TrafficFlowConfig(prior=PRIOR, module=CONFIG).build(spec)
+    sizes = {"features": DIM, "position": DIM} | {wrong: DIM + 4}
+    queries = HostQueries(*(jnp.zeros((LANES, size)) for size in sizes.values()), jnp.zeros((LANES, 11, 2)))
+    tokens = EncodedTrafficFlow(jnp.zeros((5, CONFIG.width)), prior.select(make_flow(0, instances=4)))
+    found = re.escape(
+        f"{wrong} of the queries have shape ({LANES}, {DIM + 4}), expected (Q, HostSpec.dim) = (Q, {DIM})"
+    )
+    with pytest.raises(ValueError, match=found):
+        prior.into_queries(tokens, 0, queries)

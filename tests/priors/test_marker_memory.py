@@ -1,5 +1,6 @@
 """The temporal marker memory against a few lines of numpy: decay, retrieval, ego motion, scan and stream."""
 
+import re
 from dataclasses import replace
 from functools import partial
 
@@ -231,3 +232,12 @@ def test_remembered_places_of_the_plane_stay_where_they_are_if_the_vehicle_pitch
     before.points[0] = (np.c_[places, np.zeros(2), np.ones(2)] @ pose.T)[:, :2]
     _, (_, used) = run([before, NOTHING], poses=[HERE, pose])
     np.testing.assert_allclose(used.points[used.valid][0], places, atol=1e-4)
+
+
+@pytest.mark.parametrize(("frames", "lanes", "points"), [(1, 0, 0), (0, 1, 0), (0, 0, 1)])
+def test_a_memory_of_another_size_is_named(frames, lanes, points):
+    right = CONFIG.frames, LANES, POINTS
+    wrong = CONFIG.frames + frames, LANES + lanes, POINTS + points
+    found, wanted = (re.escape(f"MarkerMemory.empty{size}") for size in (wrong, right))
+    with pytest.raises(ValueError, match=rf"the memory is {found}, .* need {wanted}"):
+        remember(MarkerMemory.empty(*wrong), seen(0.9), HERE, np.asarray(False), CONFIG)

@@ -7,6 +7,7 @@ from pathlib import Path
 from tflane_jax.convert.fitting import Missing
 from tflane_jax.convert.hosts import PublishedHost, load_host
 from tflane_jax.convert.lstr import load_lstr
+from tflane_jax.convert.weights_files import lane_graph_weights
 from tflane_jax.errors import UserError
 from tflane_jax.models.parameters import Params
 from tflane_jax.tasks.lane_graph import LaneGraphTask
@@ -33,4 +34,4 @@ def load_weights(
         raise UserError(f"{path}: an edge weight applies to GTN encoders only, not to a {type(task.model).__name__}")
     if not isinstance(task.model, PublishedHost):
         raise UserError(f"{path}: no published weights are known for a {type(task.model).__name__}")
-    return load_host(path, task.model, missing)
+    return load_host(lane_graph_weights(path), task.model, missing)

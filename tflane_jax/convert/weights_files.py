@@ -24,12 +24,14 @@ class PublishedFile:
         url: where to download it.
         licence: under which its authors published it.
         digest: of its tensors, see `digest_of`; the same for all forms of the file.
+        configuration: a shipped one that takes them.
     """
 
     files: tuple[str, ...]
     url: str
     licence: str
     digest: str
+    configuration: str
 
 
 PUBLISHED: Mapping[str, PublishedFile] = {
@@ -38,6 +40,7 @@ PUBLISHED: Mapping[str, PublishedFile] = {
         url="https://github.com/liuruijin17/LSTR/raw/c8fe59a1d8e1c456c982c9e954ee660ae9116b49/cache/nnet/LSTR/LSTR_500000.pkl",
         licence="BSD 3-Clause",
         digest="cf9fc3eef8b644c7770e6324e9d73d215aa5be201a0a4da948fea794dd1bc211",
+        configuration="gtn_lane/lstr",
     )
 }
 """By the name that `--weights` takes."""
@@ -49,10 +52,16 @@ def find_weights(path: Path) -> tuple[Path, PublishedFile | None]:
     A name of `PUBLISHED` is looked for in the folders of $TFLANE_WEIGHTS and in `weights` of the cache; an existing
     file of that name takes precedence.
 
-    Raises UserError that says where the file can be downloaded and where it belongs.
+    Raises UserError that says where the file can be downloaded and where it belongs, or which names there are.
     """
     published = PUBLISHED.get(str(path))
-    if published is None or path.exists():
+    if path.exists():
+        return path, None
+    if published is None:
+        if path.name == str(path) and not path.suffix:
+            raise UserError(
+                f"{path} is neither a file of weights nor a name of published ones, which are {', '.join(PUBLISHED)}"
+            )
         return path, None
     folders = [Path(folder).expanduser() for folder in os.environ.get("TFLANE_WEIGHTS", "").split(os.pathsep) if folder]
     folders.append(cache_root() / "weights")
@@ -65,6 +74,18 @@ def find_weights(path: Path) -> tuple[Path, PublishedFile | None]:
         f"{published.url} ({published.licence}) into {folders[-1]}, or name its folder in TFLANE_WEIGHTS. "
         f"The sha256 of its tensors, which is checked, is {published.digest}"
     )
+
+
+def lane_graph_weights(path: Path) -> Path:
+    """Return the file of weights of a lane graph's model; raise UserError for the name of published ones."""
+    published = PUBLISHED.get(str(path))
+    if published is not None and not path.exists():
+        owner, _, _ = published.configuration.partition("/")
+        raise UserError(
+            f"the published weights {path} are of {owner} models (--config {published.configuration}): for this "
+            "configuration, give a file of its own model's weights, --weights FILE"
+        )
+    return find_weights(path)[0]
 
 
 def check_digest(state: Mapping[str, np.ndarray], path: Path, published: PublishedFile | None) -> None:

@@ -1,8 +1,11 @@
-"""The only list of data sources. A new dataset is one file that defines a `DataSource`, and one entry here."""
+"""The only list of data sources.
+
+A new dataset is one file that defines a `DataSource`, and one entry here, or a call of `add_source` elsewhere.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from typing import Any, Union
 
@@ -22,7 +25,7 @@ from tflane_jax.datasets.loading import TRAINING_PARTS
 from tflane_jax.errors import UserError
 from tflane_jax.scene import CameraViews, Example, RoadImage
 
-SOURCES: tuple[DataSource[Any], ...] = (
+SOURCES: list[DataSource[Any]] = [
     procedural.SOURCE,
     procedural.CAMERAS,
     procedural.CITY_SOURCE,
@@ -37,7 +40,31 @@ SOURCES: tuple[DataSource[Any], ...] = (
     recorded_logs.SOURCE,
     front_views.SOURCE,
     tusimple.SOURCE,
-)
+]
+_SHIPPED = tuple(SOURCES)
+_told: list[Callable[[], None]] = []
+
+
+def add_source(source: DataSource[Any]) -> None:
+    """Add a dataset from outside the package to the list; call it in the module that defines the source.
+
+    Its data class can then be `RunConfig.data`, also of runs that are read back, and `--data` takes its name. A source
+    that was added under the same name before, by an earlier run of the same notebook cell, is replaced.
+
+    Raises:
+        ValueError: a source of the package has this name, or these classes.
+    """
+    for one in _SHIPPED:
+        if source.name == one.name or source.config is one.config or source.data.__name__ == one.data.__name__:
+            raise ValueError(f"tflane_jax has a data source {one.name} ({one.data.__name__}): choose other names")
+    SOURCES[:] = [*(one for one in SOURCES if one.name != source.name), source]
+    for tell in _told:
+        tell()
+
+
+def when_added(tell: Callable[[], None]) -> None:
+    """Call a function whenever a source is added."""
+    _told.append(tell)
 
 
 def data_classes() -> Any:
@@ -55,7 +82,10 @@ def named_source(name: str) -> DataSource[Any]:
     for source in SOURCES:
         if source.name == name:
             return source
-    raise UserError(f"there is no data source {name}, only {', '.join(source_names())}")
+    raise UserError(
+        f"there is no data source {name}, only {', '.join(source_names())}; an own one is added by "
+        "datasets.sources.add_source"
+    )
 
 
 def source_of(config: Any) -> DataSource[Any]:
@@ -63,7 +93,9 @@ def source_of(config: Any) -> DataSource[Any]:
     for source in SOURCES:
         if type(config) is source.config:
             return source
-    raise TypeError(f"{type(config).__name__} is the config of no data source in datasets/sources.py")
+    raise TypeError(
+        f"{type(config).__name__} is the config of no data source: add its source by datasets.sources.add_source"
+    )
 
 
 def make_dataset(config: Any) -> Any:

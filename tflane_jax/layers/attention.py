@@ -38,6 +38,9 @@ def masked_attention(
     Softmax runs in float32 also for bfloat16 inputs. A key that no query may see, and a query that may see no key, have
     no influence and zero gradients even if they hold NaN; the query's result is 0.
 
+    The gradient is written out (`jax.custom_vjp`), so it exists in reverse mode only: `jax.grad` and `jax.vjp`, not
+    `jax.jvp` and `jax.jacfwd`.
+
     Args:
         query, key, value: heads first.
         mask: true where a query may attend to a key; None allows all. Rank 2 holds for all heads.

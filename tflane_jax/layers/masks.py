@@ -131,7 +131,13 @@ class SpatialMask:
 
         Args:
             pairs: [..., i, j] lane i and instance j; with a leading axis, each head has its own.
+
+        Raises:
+            ValueError: they are not those of L lanes and T instances.
         """
+        wanted = self.lanes, len(self.valid)
+        if pairs.shape[-2:] != wanted:
+            raise ValueError(f"pairs have shape {pairs.shape}, expected ([H,] L, T) = ([H,] {wanted[0]}, {wanted[1]})")
         return replace(
             self,
             lane_traffic=_both(self.lane_traffic, pairs),

@@ -27,6 +27,7 @@ ClassMean = Literal["frame", "batch"]
 class HostLossConfig:
     """Weights of a host's loss; every host derives its own class, in its own file."""
 
+    abstract_base: ClassVar[bool] = True
     open_base: ClassVar[bool] = True
     """Settings of this type accept any subclass, see `config_io.subclasses`."""
 

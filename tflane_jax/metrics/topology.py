@@ -26,8 +26,14 @@ LEVELS = 10
 def check_versions(versions: Sequence[Version]) -> tuple[Version, ...]:
     """Return the versions as a tuple; raise UserError if there is none, an unknown one, or one of them twice."""
     known = get_args(Version)
-    if not versions or len(set(versions)) != len(versions) or not set(versions) <= set(known):
-        raise UserError(f"versions of the topology score are {versions!r}, expected some of {known}, each once")
+    if (
+        isinstance(versions, str)
+        or not versions
+        or len(set(versions)) != len(versions)
+        or not set(versions) <= set(known)
+    ):
+        wanted = f"a tuple of some of {known}, each once, such as ({known[0]!r},)"
+        raise UserError(f"versions of the topology score are {versions!r}, expected {wanted}")
     return tuple(versions)
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import flax.linen as nn
 import jax.numpy as jnp
@@ -45,6 +45,13 @@ class CameraEncoderConfig:
     bev: BevFormerConfig | LiftConfig = SMALL_BEVFORMER
     cells: bool = False
     line_masks: bool = False
+
+    open_base: ClassVar[bool] = True
+    """Settings of this type accept any subclass, see `config_io.subclasses`."""
+
+    def build(self) -> nn.Module:
+        """Return the module, which is called as `CameraEncoder` is and returns an `EncoderOutput`."""
+        return CameraEncoder(self)
 
     def limits(self) -> Rules:
         """BEV features are made of the pyramid's levels and channels."""

@@ -1,26 +1,27 @@
-"""The encoders of a host: from cameras, or from the BEV evidence raster, to BEV features."""
+"""The encoders of a host: from cameras, or from the BEV evidence raster, to BEV features.
+
+A new encoder is a module, and a subclass of the configuration that has the same input, whose `build` returns it.
+"""
 
 from __future__ import annotations
+
+from typing import Any
 
 from tflane_jax.errors import UserError
 from tflane_jax.limits import Rules
 from tflane_jax.models.bev_encoder import BevFormerConfig, BevMemory
-from tflane_jax.models.camera_encoder import CameraEncoder, CameraEncoderConfig, EncoderOutput
+from tflane_jax.models.camera_encoder import CameraEncoderConfig, EncoderOutput
 from tflane_jax.models.element_decoder import ElementDecoderConfig
-from tflane_jax.models.evidence_encoder import EvidenceEncoder, EvidenceEncoderConfig
+from tflane_jax.models.evidence_encoder import EvidenceEncoderConfig
 from tflane_jax.models.prior import BevHook
 from tflane_jax.scene import Example
 
 EncoderConfig = EvidenceEncoderConfig | CameraEncoderConfig
 
 
-def make_encoder(config: EncoderConfig) -> EvidenceEncoder | CameraEncoder:
-    """Return the encoder of a host."""
-    return EvidenceEncoder(config) if isinstance(config, EvidenceEncoderConfig) else CameraEncoder(config)
-
-
 def encode_example(
-    encoder: EvidenceEncoder | CameraEncoder,
+    encoder: Any,
+    config: EncoderConfig,
     example: Example,
     memory: BevMemory | None,
     *,
@@ -30,7 +31,8 @@ def encode_example(
     """Return the encoder's output for one example.
 
     Args:
-        encoder: the host's encoder.
+        encoder: the host's encoder, as `config.build` made it.
+        config: says what the encoder reads, images or evidence.
         example: one frame.
         memory: BEV features of the previous frame, or None.
         train: dropout is on, and batch norms use batch statistics.
@@ -39,7 +41,7 @@ def encode_example(
     Raises:
         UserError: the example lacks the encoder's input.
     """
-    if isinstance(encoder, CameraEncoder):
+    if isinstance(config, CameraEncoderConfig):
         return encoder(example, memory, train=train, fuse=hook)
     if example.bev is None:
         raise UserError(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
+from typing import ClassVar
 
 import flax.linen as nn
 import jax.numpy as jnp
@@ -49,6 +50,13 @@ class EvidenceEncoderConfig:
     coordinates: bool = False
     precision: Precision = "float32"
     remat: bool = False
+
+    open_base: ClassVar[bool] = True
+    """Settings of this type accept any subclass, see `config_io.subclasses`."""
+
+    def build(self) -> nn.Module:
+        """Return the module, which is called as `EvidenceEncoder` is."""
+        return EvidenceEncoder(self)
 
     def limits(self) -> Rules:
         """Channels split over the groups of the norms, and so over sine and cosine of x and y."""

@@ -18,7 +18,7 @@ from tflane_jax.limits import Rules, splits
 from tflane_jax.models.auxiliary import AuxiliaryName
 from tflane_jax.models.bev_encoder import BevMemory
 from tflane_jax.models.element_decoder import ElementDecoder, ElementDecoderConfig, ElementOutput
-from tflane_jax.models.encoders import EncoderConfig, encode_example, make_encoder, start_bev_memory
+from tflane_jax.models.encoders import EncoderConfig, encode_example, start_bev_memory
 from tflane_jax.models.evidence_encoder import EvidenceEncoderConfig
 from tflane_jax.models.parameters import with_torch_heads, with_xavier_layers
 from tflane_jax.models.prior import HostSpec, Prior
@@ -59,6 +59,7 @@ class HostConfig:
     elements: ElementDecoderConfig | None = None
     initial: Literal["lecun", "xavier"] = "lecun"
 
+    abstract_base: ClassVar[bool] = True
     open_base: ClassVar[bool] = True
     """Settings of this type accept any subclass, see `config_io.subclasses`."""
     truth: ClassVar[tuple[str, ...]] = ("lanes",)
@@ -158,7 +159,7 @@ class Host(nn.Module):
 
     def setup(self):
         config: HostConfig = self.config
-        self.encoder = make_encoder(config.encoder)
+        self.encoder: Any = config.encoder.build()
         if config.elements is not None:
             self.elements = ElementDecoder(config.elements)
         self.priors = _Built(config.build_priors())
@@ -205,7 +206,8 @@ class Host(nn.Module):
         """
         tokens = encode(self.priors.by_name, observations, deterministic=not train)
         hook = bev_hook(self.priors.by_name, tokens, self.config.spec)
-        encoded = encode_example(self.encoder, self.config.in_host_frame(example), memory, train=train, hook=hook)
+        seen, encoder = self.config.in_host_frame(example), self.config.encoder
+        encoded = encode_example(self.encoder, encoder, seen, memory, train=train, hook=hook)
         elements = None
         if self.config.elements is not None and encoded.front is not None:
             elements = self.elements(*encoded.front, deterministic=not train)

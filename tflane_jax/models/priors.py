@@ -1,6 +1,6 @@
 """The list of all priors, and the steps that apply to each of them.
 
-A new prior is a file with a `Prior` and its configuration, and one line in `PriorsConfig`.
+A new prior is a file with a `Prior` and its configuration, and one line in `PriorsConfig` or in a subclass of it.
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -40,6 +40,9 @@ class PriorsConfig:
     traffic_flow: TrafficFlowConfig | None = None
     sd_map: SdMapModuleConfig | None = None
     markers: MarkerFusionConfig | None = None
+
+    open_base: ClassVar[bool] = True
+    """Settings of this type accept any subclass, see `config_io.subclasses`."""
 
     def build(self, host: HostSpec) -> dict[str, Prior]:
         """Return the priors that are configured, by name."""

@@ -78,7 +78,10 @@ class MarkerMemory:
 
     @classmethod
     def empty(cls, frames: int, lanes: int, points: int) -> MarkerMemory:
-        """Return an empty bank of T frames for L lanes of K points per frame."""
+        """Return an empty bank of T frames for L lanes of K points per frame.
+
+        `remember` takes it with T = `MarkerMemoryConfig.frames`, and L and K = `MarkerPriorConfig.lanes` and `points`.
+        """
         zeros: Any = np.zeros  # typed as JAX arrays; numpy arrays work as well
         return cls(
             points=zeros((frames, lanes, points, 2), np.float32),
@@ -138,7 +141,16 @@ def remember(
         previous_from_ego: pose of this ego frame in the previous one; ignored without a previous frame.
         has_previous: False at the start of a scene; the memory is then ignored.
         config: size and decay.
+
+    Raises:
+        ValueError: the memory has not `config.frames` slots of L lanes of K points.
     """
+    size, wanted = memory.points.shape[:3], (config.frames, *observed.points.shape[:2])
+    if size != wanted:
+        raise ValueError(
+            f"the memory is MarkerMemory.empty{size}, and the configuration (frames) and what is observed (lanes and "
+            f"their points) need MarkerMemory.empty{wanted}"
+        )
     kept = memory.valid & has_previous
     points = memory.points
     if config.compensation == "ego_motion":

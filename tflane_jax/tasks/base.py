@@ -60,6 +60,8 @@ class Task(Generic[ExampleT, DataT, SourceT, MemoryT]):
     """Scores ("group/name") that a comparison tests; those that some model lacks are left out."""
     errors: ClassVar[tuple[str, ...]] = ()
     """Compared scores where lower is better."""
+    open_base: ClassVar[bool] = True
+    """Settings of this type accept any subclass, see `config_io.subclasses`."""
 
     # -----------------------------------------------------------------------------------------------------------------
     # Learning

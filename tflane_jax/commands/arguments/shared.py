@@ -61,6 +61,13 @@ def command(commands, name: str, text: str, *, function: str, module: str, epilo
         formatter_class=argparse.RawDescriptionHelpFormatter,
         **more,
     )
+    parser.add_argument(
+        "--import",
+        dest="modules",
+        metavar="MODULE",
+        action="append",
+        help="first import this module, or Python file, with own classes (may be repeated; also $TFLANE_IMPORT)",
+    )
     parser.set_defaults(module=module, function=function, takes_overrides=False)
     return parser
 

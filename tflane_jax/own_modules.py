@@ -1,0 +1,130 @@
+"""Python of the user: modules with own classes, and configuration files.
+
+A class defined there is found by its name like one of the package, also in processes that this one starts: modules are
+found by `sys.path`, which they inherit, and files by TFLANE_FILES.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import importlib
+import importlib.abc
+import importlib.machinery
+import importlib.util
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from tflane_jax.errors import UserError
+
+VARIABLE = "TFLANE_IMPORT"
+"""Environment variable: modules to import, separated by commas."""
+_FILES = "TFLANE_FILES"
+"""Environment variable for processes that this one starts: files that it has imported, one a line."""
+_PREFIX = "tflane_file_"
+
+
+def take_imports(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Return the modules that `--import MODULE` names, which may stand anywhere, and the other arguments."""
+    modules: list[str] = []
+    others: list[str] = []
+    left = list(arguments)
+    while left:
+        first = left.pop(0)
+        if first == "--":
+            others += [first, *left]
+            break
+        if first.startswith("--import="):
+            modules.append(first.removeprefix("--import="))
+        elif first == "--import" and left:
+            modules.append(left.pop(0))
+        else:
+            others.append(first)
+    return modules, others
+
+
+def add_imports(modules: Sequence[str]) -> None:
+    """Add modules to those that `import_own` imports, in this process and in those that it starts."""
+    if modules:
+        os.environ[VARIABLE] = ",".join(dict.fromkeys([*_named(), *modules]))
+
+
+def import_own() -> None:
+    """Import the modules that TFLANE_IMPORT names: importable ones, or files (`folder/own.py`).
+
+    They are looked for like those of `python -m`, also in the working directory.
+
+    Raises:
+        UserError: one of them cannot be imported.
+    """
+    for name in _named():
+        look_in(None)
+        try:
+            _ = import_file(Path(name)) if name.endswith(".py") else importlib.import_module(name)
+        except Exception as error:
+            raise UserError(
+                f"module {name} (--import or {VARIABLE}) cannot be imported: {type(error).__name__}: {error}"
+            ) from error
+
+
+def look_in(folder: Path | None) -> None:
+    """Let modules of a folder be imported, None for the working directory; installed ones of the same name win."""
+    with contextlib.suppress(FileNotFoundError):  # the working directory may be gone
+        path = os.getcwd() if folder is None else str(folder)
+        if path not in sys.path and (folder is not None or "" not in sys.path):
+            sys.path.append(path)
+
+
+def import_file(path: Path, *, beside: bool = True) -> ModuleType:
+    """Return the module of a Python file, which runs once as long as its content stays the same.
+
+    Its name comes from path and content. With `beside`, modules in its folder can be imported from then on.
+    """
+    path = path.resolve()
+    known = _files()
+    if str(path) not in known:
+        os.environ[_FILES] = "\n".join([*known, str(path)])
+    if beside:
+        look_in(path.parent)
+    return importlib.import_module(_module_name(path))
+
+
+def _named() -> list[str]:
+    return [name.strip() for name in os.environ.get(VARIABLE, "").split(",") if name.strip()]
+
+
+def _files() -> list[str]:
+    return os.environ.get(_FILES, "").splitlines()
+
+
+def _module_name(path: Path) -> str:
+    digest = hashlib.sha256(f"{path}\n".encode() + path.read_bytes()).hexdigest()[:16]
+    return f"{_PREFIX}{''.join(c if c.isalnum() else '_' for c in path.stem)}_{digest}"
+
+
+class _Loader(importlib.machinery.SourceFileLoader):
+    """Compiles the source itself: cached byte code is told from the source by its time, in seconds, and size."""
+
+    def get_code(self, fullname: str) -> Any:
+        return self.source_to_code(self.get_data(self.path), self.path)
+
+
+class _Finder(importlib.abc.MetaPathFinder):
+    """Finds the modules of `import_file`, also for what another process has pickled."""
+
+    def find_spec(
+        self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
+    ) -> importlib.machinery.ModuleSpec | None:
+        if not fullname.startswith(_PREFIX):
+            return None
+        for file in map(Path, _files()):
+            if file.is_file() and _module_name(file) == fullname:
+                return importlib.util.spec_from_file_location(fullname, file, loader=_Loader(fullname, str(file)))
+        return None
+
+
+sys.meta_path.append(_Finder())

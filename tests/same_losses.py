@@ -95,7 +95,7 @@ def numbers_of(checkout: Path, name: str, reference: str, steps: int, out: Path)
             return None
         (folder / "complete").touch()
     lines = records.read_text(encoding="utf-8").splitlines()
-    return [{k: v for k, v in json.loads(line).items() if k != "seconds"} for line in lines]
+    return [{k: v for k, v in json.loads(line).items() if k not in ("seconds", "waiting")} for line in lines]
 
 
 def difference(before: list[dict], after: list[dict]) -> str:

@@ -12,6 +12,7 @@ from tflane_jax.ablations.jobs import Job
 from tflane_jax.ablations.workers import worker_threads
 from tflane_jax.accelerators import devices_of_task, disable_triton_gemm, gpus, of_worker
 from tflane_jax.config import RunConfig
+from tflane_jax.cores import own_cores
 from tflane_jax.errors import UserError
 from tflane_jax.training import provenance
 
@@ -49,6 +50,25 @@ def slurm(visible: str | None = EIGHT, tasks="1(x4)", place=0, host=0, **further
 )
 def test_a_task_of_a_cluster_takes_the_gpus_that_are_its_own(environment, expected):
     assert devices_of_task(environment) == expected
+
+
+@pytest.mark.parametrize(
+    ("usable", "environment", "expected"),
+    [
+        (12, {}, 12),
+        (3, {}, 3),  # pinned
+        (12, slurm(tasks="4"), 3),
+        (12, slurm(tasks="16"), 1),
+        (2, slurm(tasks="4"), 2),  # bound to its own
+        (8, slurm(tasks="4", SLURM_CPUS_ON_NODE="8"), 2),  # the job has a part of the host, its tasks share it
+        (2, slurm(tasks="4", SLURM_CPUS_ON_NODE="8"), 2),
+        (12, {"OMPI_COMM_WORLD_LOCAL_RANK": "1", "OMPI_COMM_WORLD_LOCAL_SIZE": "2"}, 6),
+    ],
+)
+def test_cores_that_a_job_shares_are_divided_and_others_are_not(usable, environment, expected, monkeypatch):
+    monkeypatch.setattr(os, "cpu_count", lambda: 12)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda process: set(range(usable)))
+    assert own_cores(environment) == expected
 
 
 @pytest.fixture

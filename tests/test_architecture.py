@@ -13,6 +13,7 @@ from tests.shared import ROOT
 FLOORS = (
     "errors",
     "limits accelerators memory own_modules",
+    "cores",
     "config_io config_files migrations processes progress startup child_processes",
     "devices",
     "geometry",

@@ -178,6 +178,17 @@ def test_a_weight_that_no_loss_of_map_lines_read_is_dropped(losses):
     assert from_json(RunConfig, migrate(old)[0]).task.losses == losses
 
 
+@pytest.mark.parametrize(
+    ("threads", "ahead", "expected"),
+    [(4, 16, (None, None)), (8, 16, (8, 16)), (4, 32, (4, 32)), (4, None, (4, None))],
+)
+def test_workers_of_the_former_default_are_those_of_the_machine(threads, ahead, expected):
+    old = to_json(RunConfig())
+    old["data"]["loading"] |= {"threads": threads, "ahead": ahead}
+    loading = migrate(old)[0]["data"]["loading"]
+    assert (loading["threads"], loading["ahead"]) == expected
+
+
 def test_new_settings_are_listed_with_their_defaults():
     now = to_json(RunConfig())
     before = copy.deepcopy(now)

@@ -37,7 +37,7 @@ def devices_of_task(environment: Mapping[str, str]) -> list[int] | None:
     if (visible := environment.get(_VISIBLE)) is None:
         return None
     seen = len([name for name in visible.split(",") if name.strip()])
-    tasks, place = _tasks_on_host(environment)
+    tasks, place = tasks_on_host(environment)
     bound = any(name in environment for name in ("SLURM_GPUS_PER_TASK", "SLURM_NTASKS_PER_GPU"))
     bound = bound or "gpu" in environment.get("SLURM_TRES_PER_TASK", "")
     if tasks == 1 or bound or seen < tasks:
@@ -48,7 +48,7 @@ def devices_of_task(environment: Mapping[str, str]) -> list[int] | None:
     return list(range(place * each, (place + 1) * each))
 
 
-def _tasks_on_host(environment: Mapping[str, str]) -> tuple[int, int]:
+def tasks_on_host(environment: Mapping[str, str]) -> tuple[int, int]:
     """Return how many processes of the job are on this host, and the number of this one among them."""
     # Slurm's variables in processes of mpirun are those of the batch script. JAX tells them in the same way.
     by_mpirun = "OMPI_MCA_orte_hnp_uri" in environment and "OMPI_COMM_WORLD_LOCAL_RANK" in environment

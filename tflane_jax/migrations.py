@@ -221,6 +221,12 @@ def _unused_reference_batch(node: Json, path: str, root: Json) -> tuple[Json, li
     return node | {"reference_batch": None} if unused else node, []
 
 
+def _former_workers(node: Json, path: str, root: Json) -> tuple[Json, list[str]]:
+    """Drop the former defaults of the workers that load examples, on which no example depends."""
+    former = node.get("threads") == 4 and node.get("ahead") == 16
+    return node | {"threads": None, "ahead": None} if former else node, []
+
+
 # ---------------------------------------------------------------------------------------------------------------------
 # The changes so far, oldest first. Add new ones at the end.
 
@@ -250,4 +256,5 @@ MIGRATIONS: tuple[Migration, ...] = (
     unused_setting("SegmentDecoderConfig", "edge_weight"),
     unused_setting("MapTrLossConfig", "cell_weight"),
     unused_setting("MapTrV2LossConfig", "cell_weight"),
+    _at_class("StreamingConfig", _former_workers),
 )

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from tests.fakes import BrokenDataset, DeadlyDataset, FakeConfig, FakeDataset
+from tflane_jax.datasets import streaming
 from tflane_jax.datasets.batches import (
     batch_indices,
     batches,
@@ -186,6 +187,24 @@ def test_unneeded_parts_are_not_loaded():
     while any("grain" in thread.name for thread in threading.enumerate()) and time.monotonic() < deadline:
         time.sleep(0.01)
     assert not [thread.name for thread in threading.enumerate() if "grain" in thread.name]
+
+
+@pytest.mark.parametrize(
+    ("cores", "given", "expected"),
+    [
+        (1, {}, (1, 16)),
+        (2, {}, (1, 16)),
+        (8, {}, (7, 16)),
+        (64, {}, (63, 126)),
+        (64, {"processes": 8}, (7, 16)),
+        (4, {"processes": 8}, (1, 16)),
+        (64, {"threads": 4}, (4, 16)),
+        (64, {"threads": 0, "ahead": 5}, (0, 5)),
+    ],
+)
+def test_workers_are_as_many_as_the_cores_of_this_process_less_one(cores, given, expected, monkeypatch):
+    monkeypatch.setattr(streaming, "own_cores", lambda environment: cores)
+    assert StreamingConfig(**given).workers() == expected
 
 
 @pytest.mark.parametrize("change", [{"threads": -1}, {"processes": -1}, {"ahead": 0}])

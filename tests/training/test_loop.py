@@ -32,7 +32,8 @@ def arrays(folder: Path, step: int = 30) -> dict[str, bytes]:
 
 
 def timeless(folder: Path) -> list[dict]:
-    return [{k: v for k, v in record.items() if k != "seconds"} for record in read_records(folder / "metrics.jsonl")]
+    timed, records = ("seconds", "waiting"), read_records(folder / "metrics.jsonl")
+    return [{k: v for k, v in record.items() if k not in timed} for record in records]
 
 
 @pytest.fixture(scope="module")

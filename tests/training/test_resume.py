@@ -66,6 +66,17 @@ def test_a_run_that_lacks_a_new_setting_resumes_with_its_default(tmp_path, capsy
         run(folder, start="resume", current_form=completed, resolved=other)
 
 
+def test_a_resumed_run_may_have_other_workers(tmp_path):
+    folder, workers = tmp_path / "run", {"threads": None, "ahead": None, "processes": 0}
+    settings = RESOLVED | {"data": {"loading": {"where": "disk"} | workers}}
+    run(folder, config=dataclasses.replace(CONFIG, steps=10), resolved=settings)
+    more = RESOLVED | {"data": {"loading": {"where": "disk", "threads": 9, "ahead": 30, "processes": 2}}}
+    run(folder, start="resume", resolved=more)
+    assert json.loads((folder / "config.json").read_text()) == more
+    with pytest.raises(UserError, match=r"data\.loading\.where"):
+        run(folder, start="resume", resolved=RESOLVED | {"data": {"loading": {"where": "memory"} | workers}})
+
+
 def test_a_file_system_without_locks_is_told_and_trained_on(tmp_path, capsys, monkeypatch):
     def no_locks(*_):
         raise OSError(errno.ENOLCK, "No locks available")

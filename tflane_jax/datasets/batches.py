@@ -78,7 +78,7 @@ def in_workers(arrays: Any, config: StreamingConfig) -> Any:
     The thread that gathers batches does so, which gives the same ones, without threads or grain. Streamed examples are
     returned as they are: their workers augment them.
     """
-    if isinstance(arrays, Streamed) or not config.threads or find_spec("grain") is None:
+    if isinstance(arrays, Streamed) or config.threads == 0 or find_spec("grain") is None:
         return arrays
     return Streamed(_Rows(arrays), replace(config, processes=0))
 

@@ -6,6 +6,7 @@ nor an interruption changes it, and the position in the data is the step in the 
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from types import ModuleType
@@ -13,6 +14,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from tflane_jax.cores import own_cores
 from tflane_jax.datasets.base import IndexedExamples
 from tflane_jax.errors import UserError, missing_extra
 from tflane_jax.limits import Count, CountOrZero
@@ -32,17 +34,24 @@ class StreamingConfig:
     Attributes:
         where: "memory": all examples of a split are read once and kept; "disk": each is read, decoded and prepared
             shortly before it is needed; "auto": what suits the dataset (docs/scale.md has the table).
-        threads: threads that load and augment examples, in each process; 0 does so on request.
-        ahead: examples loaded ahead of the current one, in each process.
+        threads: threads that load and augment examples, in each process; 0 does so on request. None takes one less
+            than the cores of this process (`cores.own_cores`), divided among `processes`, but at least one.
+        ahead: examples loaded ahead of the current one, in each process. None: twice the threads, but at least 16.
         processes: further processes that load, for datasets whose code holds Python's global lock (decoding images
             does not). The caller's script must then be guarded by `if __name__ == "__main__":`. Not for examples in
             memory.
     """
 
     where: Literal["auto", "memory", "disk"] = "auto"
-    threads: CountOrZero = 4
-    ahead: Count = 16
+    threads: CountOrZero | None = None
+    ahead: Count | None = None
     processes: CountOrZero = 0
+
+    def workers(self) -> tuple[int, int]:
+        """Return threads and examples ahead, with the numbers that None stands for in this process."""
+        each = max((own_cores(os.environ) - 1) // max(self.processes, 1), 1)
+        threads = each if self.threads is None else self.threads
+        return threads, max(2 * threads, 16) if self.ahead is None else self.ahead
 
 
 class Request(NamedTuple):
@@ -130,15 +139,16 @@ class Streamed:
                 died.
             Exception: what else `dataset.example` raises.
         """
-        if min(self.config.threads, self.config.processes) < 0 or self.config.ahead < 1:
+        (threads, ahead), processes = self.config.workers(), self.config.processes
+        if min(threads, processes) < 0 or ahead < 1:
             raise UserError(f"{self.config}: threads and processes must be at least 0, ahead at least 1")
         grain = _grain()
         wanted = grain.MapDataset.range(count).map(_Load(self, requests, prepare))
-        ahead = self.config.ahead if self.config.threads else 0
-        loaded = wanted.to_iter_dataset(grain.ReadOptions(num_threads=self.config.threads, prefetch_buffer_size=ahead))
-        if self.config.processes:
+        options = grain.ReadOptions(num_threads=threads, prefetch_buffer_size=ahead if threads else 0)
+        loaded = wanted.to_iter_dataset(options)
+        if processes:
             _mark_flags_as_parsed()
-            loaded = loaded.mp_prefetch(grain.MultiprocessingOptions(num_workers=self.config.processes))
+            loaded = loaded.mp_prefetch(grain.MultiprocessingOptions(num_workers=processes))
         iterator = iter(loaded)
         try:
             yield from iterator

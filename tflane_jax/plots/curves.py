@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 # Fields of a record that are not curves.
-_NOT_DRAWN = ("step", "split", "seconds")
+_NOT_DRAWN = ("step", "split", "seconds", "waiting")
 
 Series = tuple[Int[np.ndarray, " n"], Float[np.ndarray, "n seeds"]]
 

@@ -37,6 +37,7 @@ from tflane_jax.training.schedule import OptimConfig, make_optimizer, scaled_to_
 from tflane_jax.training.sharding import placed
 from tflane_jax.training.state import init_states, of_all_seeds, per_seed, state_of
 from tflane_jax.training.step import UpdateForm, compiled_update, update_all
+from tflane_jax.training.step_time import StepTime
 from tflane_jax.training.task import Trainable
 
 Evaluate = Callable[[Params], dict[str, float]]
@@ -177,7 +178,7 @@ def train(
             # Augmentation may change the size of images, and the model takes what it returns.
             example = example if prepare is None else prepare(example, (config.seeds[0], 0, 0))
             states = init_states(task, optimizer, config.seeds, example)
-        window, metrics, seconds = Window(), {}, 0.0
+        window, metrics, times = Window(), {}, StepTime()
         memories, started_from = [Memory() for _ in config.seeds], {}
         if start == "resume" and (latest := from_first(lambda: _latest(checkpoints))) is not None:
             whole = of_all_seeds(states)
@@ -185,7 +186,7 @@ def train(
                 restored = arrays_from_first(lambda: checkpoints.restore(latest["step"], whole), whole)
             states = per_seed(restored, config.seeds)
             try:
-                window, metrics, seconds, memories = _carried(latest["progress"], memories)
+                window, metrics, times.seconds, memories = _carried(latest["progress"], memories)
             except (KeyError, TypeError, ValueError, AttributeError) as error:
                 raise checkpoints.damaged_progress(latest["step"], error) from error
         elif (origin := config.init_from) is not None:
@@ -231,14 +232,14 @@ def train(
         # Steps
         # =============================================================================================================
         def save(evaluated: dict[str, float]) -> None:
-            carried = {"window": asdict(window), "seconds": seconds, "metrics": metrics}
+            carried = {"window": asdict(window), "seconds": times.seconds, "metrics": metrics}
             if adaptive is not None:
                 carried["cycles"] = [asdict(memory) for memory in memories]
             manifest = Manifest(step=step, config=resolved, metrics=evaluated, progress=carried)
             kept = of_all_seeds([of_one_process(state) for state in states])
             from_first(lambda: str(checkpoints.save(kept, manifest)))
 
-        stepping, saved_step, stopped = 0.0, first, stop_signal(stop.signal, 0)
+        saved_step, stopped = first, stop_signal(stop.signal, 0)
         untold = dict(getattr(task, "notices", {}))
         with (
             RecordWriter(folder, first) if is_first() else Unwritten() as writer,
@@ -252,18 +253,20 @@ def train(
                     raise AgreedError(_not_finite(values, step, config.seeds, checkpoints.path(step)))
                 step += 1
                 window.add({name: value for name, value in values.items() if name != "finite"})
+                asked = time.perf_counter()
                 batch = next(feed, None)
-                elapsed = time.perf_counter() - began
-                stepping, seconds = stepping + elapsed, seconds + elapsed
+                ended = time.perf_counter()
+                times.add(ended - began, waited=ended - asked)
                 bar.update()
 
                 is_last = step == config.steps
                 if step % config.log_every == 0 or is_last:
                     record = window.record(step)
-                    writer.write(record | {"seconds": seconds})
+                    writer.write(record | times.record())
+                    _print_notices(times.notices(step, arrays))  # every process waits for examples of its own
                     if is_first():
                         _print_notices(_due(untold, record))
-                    bar.set_postfix(loss=f"{np.mean(record['loss']):.4g}", refresh=False)
+                    bar.set_postfix_str(f"loss={np.mean(record['loss']):.4g}{times.shown()}", refresh=False)
                     window = Window()
                 if evaluate is not None and (step % config.eval_every == 0 or is_last):
                     measured = [evaluate(state.ema_params) for state in states]  # several processes predict together
@@ -293,7 +296,7 @@ def train(
             # =========================================================================================================
             if step > saved_step:
                 save({})
-        rate = (step - first) / stepping if stepping else 0.0
+        rate = (step - first) / times.own if times.own else 0.0
         unfinished = stopped if step < config.steps else None
         return TrainingResult(step, metrics, compile_seconds, rate, asked_by=stopped, stopped_by=unfinished)
 

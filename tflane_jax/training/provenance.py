@@ -20,6 +20,7 @@ from typing import Any
 import jax
 
 import tflane_jax
+from tflane_jax.cores import usable_cores
 from tflane_jax.files.atomic import write_json
 
 _PACKAGES = ("tflane_jax", "jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "numpy", "scipy")
@@ -47,7 +48,7 @@ def thread_setting(cores: int | None = None, devices: int | None = None) -> dict
         cores, devices: numbers to report instead, for a process that is going to be started on as many.
     """
     if cores is None:
-        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        cores = usable_cores()
     setting: dict[str, Any] = {"cores": cores} | {name: os.environ[name] for name in _VARIABLES if name in os.environ}
     device = _device(devices)
     if not device.startswith(_CPU):

@@ -21,12 +21,14 @@ from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import check_writable, is_temporary
 from tflane_jax.files.fields import load_json
 from tflane_jax.files.locks import take
+from tflane_jax.migrations import value_at
 from tflane_jax.startup import write
 
 Start = Literal["new", "resume", "overwrite"]
 CurrentForm = Callable[[dict[str, Any]], tuple[dict[str, Any], list[str]]]
 """Saved configuration (JSON) -> the same in the form of this version, and notices for the user."""
 _COPY = 'A copy is the entry "config" of checkpoints/step_.../manifest.json: write it there, or start with --overwrite'
+_WORKERS = ("threads", "ahead", "processes")  # of `StreamingConfig`
 _CONTENT = (
     "config.json",
     "config.txt",
@@ -57,9 +59,16 @@ def read_config(folder: Path) -> dict[str, Any]:
 
 
 def fixed(config: dict[str, Any]) -> dict[str, Any]:
-    """Return a configuration (JSON) without what a resumed run may change: where the devices hold its state."""
+    """Return a configuration (JSON) without what a resumed run may change.
+
+    That is where the devices hold its state, and the workers that load examples: no batch depends on these.
+    """
     training = {name: value for name, value in config.get("training", {}).items() if name != "shard_state"}
-    return config | {"training": training}
+    config = config | {"training": training}
+    if isinstance(loading := value_at(config, "data.loading"), dict):
+        others = {name: value for name, value in loading.items() if name not in _WORKERS}
+        config |= {"data": config["data"] | {"loading": others}}
+    return config
 
 
 def check_unchanged(folder: Path, resolved: dict[str, Any], current_form: CurrentForm | None = None) -> list[str]:

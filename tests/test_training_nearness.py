@@ -41,7 +41,7 @@ def test_the_training_split_may_lie_in_another_folder(tmp_path):
     pytest.importorskip("cv2")
     scenes = DriveDataset(DriveConfig(scenes=1))
     root = export_openlane_v2({"train": scenes, "val": scenes}, tmp_path / "data", progress=False)
-    source = OpenLaneV2Config(root, "val", "B", image=None)
+    source = OpenLaneV2Config(root, "val", subset="B", image=None)
     found = training_nearness(RunConfig(data=WorldData()), source, root)
     assert found is not None
     assert found.groups == ["near training"] * 3
@@ -65,7 +65,7 @@ def test_the_source_logs_tell_the_city_of_training_frames(tmp_path):
         (tmp_path / folder / "map").mkdir(parents=True)
         (tmp_path / folder / "map" / f"log_map_archive_x____{city}_city_1.json").touch()
         (tmp_path / folder / ANNOTATIONS).touch()
-    source = OpenLaneV2Config(root, "val", "A", image=None, tracks=tmp_path / "both")
+    source = OpenLaneV2Config(root, "val", subset="A", image=None, tracks=tmp_path / "both")
     found = training_nearness(RunConfig(data=WorldData()), source, root)
     assert found is not None
     assert found.groups == ["near training"] * 3 + ["far from training"] * 3

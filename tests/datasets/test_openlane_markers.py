@@ -18,7 +18,7 @@ from tflane_jax.errors import UserError
 from tflane_jax.geometry import PerceptionRange, relative_pose, transform_points
 from tflane_jax.markers.pixels import PixelConfig
 from tflane_jax.markers.simulation import PERFECT, MarkerConfig
-from tflane_jax.world.render.camera import FrontCamera
+from tflane_jax.world.render.camera import PinholeCamera
 from tflane_jax.world.roads.markers import PlacementConfig
 from tflane_jax.world.roads.sd_map import SdMapConfig
 
@@ -32,7 +32,7 @@ def camera(focal=800.0, width=1000, height=1000):
     """Return a camera 1.5 m above the ground that looks straight ahead."""
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = AXES, -AXES @ [0.0, 0.0, 1.5]
-    return FrontCamera(width, height, np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]]), pose)
+    return PinholeCamera(width, height, np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]]), pose)
 
 
 def drive(cameras=None, places=(0.0, 5.0, 10.0, 15.0, 20.0)):

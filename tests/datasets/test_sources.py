@@ -28,8 +28,8 @@ from tflane_jax.config_io import from_json, to_json
 from tflane_jax.config_overrides import apply_overrides
 from tflane_jax.datasets import sources
 from tflane_jax.datasets.argoverse2 import Argoverse2Config
-from tflane_jax.datasets.base import SPLITS
-from tflane_jax.datasets.data_source import loading_of
+from tflane_jax.datasets.base import SPLITS, ExampleConfig
+from tflane_jax.datasets.data_source import loading_of, split_config
 from tflane_jax.datasets.front_views import FrontViewConfig
 from tflane_jax.datasets.nuscenes import NuScenesConfig
 from tflane_jax.datasets.openlane_v2 import OpenLaneV2Config
@@ -106,6 +106,31 @@ def test_data_of_a_run_lead_to_their_source(data, kind, names):
     for config in splits:
         source = sources.source_of(config)
         assert (source.data, source.config, source.example) == (type(data), type(config), kind)
+
+
+@pytest.mark.parametrize(
+    ("data", "of_training"),
+    [
+        (LogData(Path("a"), Path("b"), Path("c"), keyframes="annotations", image=TOPONET_SUBSET_B), {}),
+        (OpenLaneV2Data(Path("o"), subset="B", tracks=Path("t"), map_changes="drop"), {"map_changes": "keep"}),
+        (NuScenesData(Path("n"), frame="lidar", image=TOPONET_SUBSET_B, depth_cell=8), {"depth_cell": None}),
+        (SceneFileData(Path("n"), ("a",), ("b",), ("c",), ExampleConfig(lanes=7)), {}),
+    ],
+)
+def test_settings_of_a_run_reach_every_split(data, of_training):
+    """`of_training`: settings of the training split, with what they are for the others."""
+    for split in SPLITS:
+        config = data.source(split)
+        shared = {f.name for f in fields(data)} & {f.name for f in fields(config)}
+        expected = {name: getattr(data, name) for name in shared} | (of_training if split != "train" else {})
+        assert {name: getattr(config, name) for name in shared} == expected
+        own = {f.name: getattr(config, f.name) for f in fields(config) if f.name not in shared}
+        assert list(own.values()) == [getattr(data, split)]
+
+
+def test_a_setting_that_the_data_lack_has_to_be_given():
+    with pytest.raises(AttributeError, match="split"):
+        split_config(NuScenesConfig, NuScenesData(Path("n")))
 
 
 @pytest.mark.parametrize("source", sources.SOURCES, ids=lambda source: source.name)

@@ -21,13 +21,13 @@ from tflane_jax.scene.marker_patterns import (
     marker_count,
 )
 from tflane_jax.world.cameras.pictures import paint_picture
-from tflane_jax.world.render.camera import FrontCamera, camera_pose
+from tflane_jax.world.render.camera import PinholeCamera, camera_pose
 
 cv2 = pytest.importorskip("cv2")
 
 ARUCO, APRILTAG = MarkerFamily.ARUCO_5X5_100, MarkerFamily.APRILTAG_36H11
 INTRINSICS = np.array([[900.0, 0.0, 480.0], [0.0, 900.0, 270.0], [0.0, 0.0, 1.0]])
-AHEAD = FrontCamera(960, 540, INTRINSICS, camera_pose(1.5, 0.0))
+AHEAD = PinholeCamera(960, 540, INTRINSICS, camera_pose(1.5, 0.0))
 # A second one a metre to the left and turned to the right.
 ASIDE = replace(
     AHEAD,

@@ -15,13 +15,13 @@ from tflane_jax.limits import check_settings
 from tflane_jax.world.cameras.depth import render_depth
 from tflane_jax.world.cameras.ring import CameraRigConfig
 from tflane_jax.world.cameras.solids import pack
-from tflane_jax.world.render.camera import FrontCamera, camera_pose
+from tflane_jax.world.render.camera import PinholeCamera, camera_pose
 from tflane_jax.world.render.polygons import Solid
 from tflane_jax.world.render.shapes import box
 
 pytest.importorskip("cv2")
 
-CAMERA = FrontCamera(64, 48, np.array([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]]), camera_pose(1.5, 0.0))
+CAMERA = PinholeCamera(64, 48, np.array([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]]), camera_pose(1.5, 0.0))
 
 
 def block(x, width=2.0, height=3.0):

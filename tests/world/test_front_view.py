@@ -14,7 +14,7 @@ from tflane_jax.world.front_view.road import WHITE, Stripe
 from tflane_jax.world.front_view.roadside import Roadside
 from tflane_jax.world.front_view.traffic import FrontTrafficConfig
 from tflane_jax.world.front_view.views import FrontWorldConfig, draw_front_scene, front_view, render, scene_lines
-from tflane_jax.world.render.camera import FrontCamera
+from tflane_jax.world.render.camera import PinholeCamera
 from tflane_jax.world.render.weather import Sky
 from tflane_jax.world.roads.curves import ReferenceLine
 
@@ -90,7 +90,7 @@ def test_a_mirrored_road_has_mirrored_labels(scene_id):
     pose = flip @ scene.camera.camera_from_ego @ np.diag([1.0, -1.0, 1.0, 1.0])
     intrinsics = scene.camera.intrinsics.copy()
     intrinsics[0, 2] = scene.camera.width - intrinsics[0, 2]
-    camera = FrontCamera(scene.camera.width, scene.camera.height, intrinsics, pose)
+    camera = PinholeCamera(scene.camera.width, scene.camera.height, intrinsics, pose)
     axis = scene.road.axis
     road = replace(
         scene.road,

@@ -15,7 +15,7 @@ from tflane_jax.world.cameras.light import look
 from tflane_jax.world.cameras.solids import pack
 from tflane_jax.world.cameras.surface import Surface, surface_at
 from tflane_jax.world.moving import with_vertices
-from tflane_jax.world.render.camera import FrontCamera, camera_pose
+from tflane_jax.world.render.camera import PinholeCamera, camera_pose
 from tflane_jax.world.render.polygons import Solid
 from tflane_jax.world.simulate import WorldConfig, simulate
 from tflane_jax.world.terrain import TerrainConfig
@@ -24,7 +24,7 @@ from tflane_jax.world.terrain import TerrainConfig
 HILL = Terrain(np.array([[2 * np.pi / 60, 0.0]]), np.array([0.0]), np.array([2.0]))
 FLAT = replace(HILL, amplitude=np.zeros(1))
 WORLD = WorldConfig(duration_s=2.4, keyframes=2)
-CAMERA = FrontCamera(48, 32, np.array([[30.0, 0, 24], [0, 30, 14], [0, 0, 1]]), camera_pose(1.6, 0.05))
+CAMERA = PinholeCamera(48, 32, np.array([[30.0, 0, 24], [0, 30, 14], [0, 0, 1]]), camera_pose(1.6, 0.05))
 
 
 @pytest.fixture(scope="module")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ from tflane_jax.datasets.argoverse2_log import (
     log_outline,
 )
 from tflane_jax.datasets.base import SPLITS, ExampleConfig, FrameInfo, Split
-from tflane_jax.datasets.data_source import Choice, DataSource, FolderCheck
+from tflane_jax.datasets.data_source import Choice, DataSource, FolderCheck, split_config
 from tflane_jax.datasets.examples import make_example
 from tflane_jax.datasets.log_frames import LogFrames
 from tflane_jax.datasets.openlane_example import camera_views
@@ -38,25 +38,35 @@ _PICTURES = ImageConfig(scale=0.5)
 """Of images that no model reads: whole, at half the size."""
 
 
-@dataclass(frozen=True)
-class Argoverse2Config:
-    """Which logs, which of their frames, and how they become examples.
+@dataclass(frozen=True, kw_only=True)
+class Argoverse2Settings:
+    """How frames become examples: the settings of one folder of logs and of a run have these in common.
 
     Attributes:
-        root: a dataset root (sensor/<split>/<log id>/), a split, a folder of logs, or one log; all logs below it.
-        keyframes, openlane: see `load_log`.
+        keyframes: which frames become examples, see `load_log`.
+        openlane: folder of the OpenLane-V2 split files, which hold the exact timestamps, see `load_log`.
         example: what is in an example, and its capacities. `example.cameras` draws images of map and boxes.
         loading: memory or disk, and workers.
         image: scaling and cropping of the recorded images of the ring cameras, which then take the place of drawn ones;
             None does not read them.
     """
 
-    root: Path
     keyframes: Keyframes = "openlane_v2"
     openlane: Path | None = None
-    example: ExampleConfig = field(default_factory=ExampleConfig)
+    example: ExampleConfig = ExampleConfig()
     loading: StreamingConfig = StreamingConfig()
     image: ImageConfig | None = None
+
+
+@dataclass(frozen=True)
+class Argoverse2Config(Argoverse2Settings):
+    """Which logs.
+
+    Attributes:
+        root: a dataset root (sensor/<split>/<log id>/), a split, a folder of logs, or one log; all logs below it.
+    """
+
+    root: Path
 
 
 class Argoverse2Dataset:
@@ -126,33 +136,22 @@ def _views(
 
 
 @dataclass(frozen=True)
-class LogData:
+class LogData(Argoverse2Settings):
     """Argoverse 2 logs for training, validation and test.
 
     Attributes:
         train, val, test: a log or a folder of logs for each split.
-        keyframes: which frames become examples, see `load_log`.
-        openlane: folder of the OpenLane-V2 split files, which hold the exact timestamps.
-        example: what is in an example, and its capacities.
-        loading: memory or disk, and workers.
-        image: scaling and cropping of the ring cameras' images, see `Argoverse2Config`; None does not read them.
         augmentation: of training images, or None.
     """
 
     train: Path
     val: Path
     test: Path
-    keyframes: Keyframes = "openlane_v2"
-    openlane: Path | None = None
-    example: ExampleConfig = ExampleConfig()
-    loading: StreamingConfig = StreamingConfig()
-    image: ImageConfig | None = None
     augmentation: PhotometricConfig | None = None
 
     def source(self, split: Split) -> Argoverse2Config:
         """Return the dataset of a split."""
-        root: Path = getattr(self, split)
-        return Argoverse2Config(root, self.keyframes, self.openlane, self.example, self.loading, self.image)
+        return split_config(Argoverse2Config, self, root=getattr(self, split))
 
 
 def _split_folder(choice: Choice) -> Path:

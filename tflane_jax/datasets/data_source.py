@@ -8,9 +8,9 @@ opens such a config, and the frozen dataclass that a run configuration holds for
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any, Generic, Literal, Protocol, TypeVar
+from typing import Any, Generic, Literal, Protocol, TypeVar, cast
 
 from tflane_jax.datasets.base import ExampleConfig, Split
 from tflane_jax.datasets.loading import load_or_stream
@@ -129,6 +129,12 @@ class DataSource(Generic[ConfigT]):
     interval: Callable[[ConfigT], float | None] = lambda config: None
     no_drives: str = ""
     cameras: Callable[[ConfigT], tuple[str, ...] | None] = lambda config: None
+
+
+def split_config(config: type[ConfigT], data: Any, **own: Any) -> ConfigT:
+    """Return the config of a split with `own` settings; all others are those of a run's data with the same name."""
+    shared = {each.name: getattr(data, each.name) for each in fields(cast(Any, config)) if each.name not in own}
+    return config(**shared | own)
 
 
 def loading_of(config: Any) -> StreamingConfig:

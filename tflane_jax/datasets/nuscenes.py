@@ -2,14 +2,14 @@
 
 <root>/v1.0-trainval/*.json          the thirteen tables (or v1.0-mini, ...)
 <root>/maps/expansion/<city>.json    map expansion, version 1.3
-<root>/samples/CAM_*/*.jpg           images of the key frames; read if `NuScenesConfig.image` is given
-<root>/samples/LIDAR_TOP/*.pcd.bin   sweeps of the key frames; read if `NuScenesConfig.depth_cell` is given
+<root>/samples/CAM_*/*.jpg           images of the key frames; read if `NuScenesSettings.image` is given
+<root>/samples/LIDAR_TOP/*.pcd.bin   sweeps of the key frames; read if `NuScenesSettings.depth_cell` is given
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import KW_ONLY, dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Literal
@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float
 
 from tflane_jax.datasets.base import ExampleConfig, FrameInfo, Split
-from tflane_jax.datasets.data_source import Choice, DataSource
+from tflane_jax.datasets.data_source import Choice, DataSource, split_config
 from tflane_jax.datasets.examples import make_example
 from tflane_jax.datasets.log_frames import KEPT_LOGS
 from tflane_jax.datasets.nuscenes_cameras import (
@@ -64,12 +64,11 @@ _CITIES = 4
 
 
 @dataclass(frozen=True)
-class NuScenesConfig:
-    """Which scenes, and how their key frames become examples.
+class NuScenesSettings:
+    """How key frames become examples: the settings of one split and of a run have these in common.
 
     Attributes:
         root: folder of the data set.
-        split: official split by scene name; the official test split has no annotations.
         version: folder of the tables, such as "v1.0-mini"; None finds it, see `nuscenes_tables.find_tables`.
         splits: JSON file {split: [scene names]} in place of the official splits.
         misplaced: whether to use five official scenes that do not fit the map, as MapTR does: "keep" or "drop", see
@@ -90,7 +89,7 @@ class NuScenesConfig:
     """
 
     root: Path
-    split: Split = "train"
+    _: KW_ONLY
     version: str | None = None
     splits: Path | None = None
     misplaced: Literal["keep", "drop"] = "keep"
@@ -102,6 +101,17 @@ class NuScenesConfig:
     depth_cell: Count | None = None
     example: ExampleConfig = NUSCENES_SIZES
     loading: StreamingConfig = StreamingConfig()
+
+
+@dataclass(frozen=True)
+class NuScenesConfig(NuScenesSettings):
+    """One split.
+
+    Attributes:
+        split: official split by scene name; the official test split has no annotations.
+    """
+
+    split: Split = "train"
 
 
 class NuScenesDataset:
@@ -221,33 +231,17 @@ def _reach(config: ExampleConfig) -> float:
 
 
 @dataclass(frozen=True)
-class NuScenesData:
-    """nuScenes, read from disk while training.
+class NuScenesData(NuScenesSettings):
+    """nuScenes, read from disk while training; `depth_cell` is of training images, others need no depth.
 
     Attributes:
-        root: folder of the data set.
         train, val, test: which official split serves as each; the official test split has no annotations.
-        version, splits, misplaced, frame, least_visibility, camera_poses, can_bus, image, example, loading: see
-            `NuScenesConfig`.
-        depth_cell: the same, of training images; others need no depth.
         augmentation: of training images, or None.
     """
 
-    root: Path
     train: Split = "train"
     val: Split = "val"
     test: Split = "val"
-    version: str | None = None
-    splits: Path | None = None
-    misplaced: Literal["keep", "drop"] = "keep"
-    frame: ReferenceFrame = "ego"
-    least_visibility: Visibility = "v0-40"
-    camera_poses: CameraPoses = "exposure"
-    can_bus: CanBus = "none"
-    image: ImageConfig | None = None
-    depth_cell: Count | None = None
-    example: ExampleConfig = NUSCENES_SIZES
-    loading: StreamingConfig = StreamingConfig()
     augmentation: PhotometricConfig | None = None
 
     def limits(self) -> Rules:
@@ -256,9 +250,8 @@ class NuScenesData:
 
     def source(self, split: Split) -> NuScenesConfig:
         """Return the dataset of a split."""
-        own = {"split": getattr(self, split), "depth_cell": self.depth_cell if split == "train" else None}
-        shared = {field.name: getattr(self, field.name) for field in fields(NuScenesConfig) if field.name not in own}
-        return NuScenesConfig(**shared, **own)
+        depth_cell = self.depth_cell if split == "train" else None
+        return split_config(NuScenesConfig, self, split=getattr(self, split), depth_cell=depth_cell)
 
 
 def _choose(choice: Choice) -> NuScenesConfig:

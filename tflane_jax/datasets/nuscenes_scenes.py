@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 
 from tflane_jax.datasets.base import SPLITS, ExampleConfig, FrameInfo, Split
-from tflane_jax.datasets.data_source import Choice, DataSource, FolderCheck
+from tflane_jax.datasets.data_source import Choice, DataSource, FolderCheck, split_config
 from tflane_jax.datasets.examples import make_example
 from tflane_jax.datasets.log_frames import LogFrames
 from tflane_jax.datasets.nuscenes_scene_files import find_scene_files, read_scene_file, scene_file_outline
@@ -96,7 +96,7 @@ class SceneFileData:
 
     def source(self, split: Split) -> SceneFileConfig:
         """Return the dataset of a split."""
-        return SceneFileConfig(self.root, getattr(self, split), self.example, self.loading)
+        return split_config(SceneFileConfig, self, scenes=getattr(self, split))
 
 
 def check_scene_files(root: Path) -> FolderCheck:

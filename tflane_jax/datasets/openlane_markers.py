@@ -28,7 +28,7 @@ from tflane_jax.markers.visibility import in_images
 from tflane_jax.scene import MarkerObservations
 from tflane_jax.scene.logs import KeyFrame, Log, PlacedMarkers, Tracks, VectorMap
 from tflane_jax.world.mirror import markers_beside
-from tflane_jax.world.render.camera import FrontCamera
+from tflane_jax.world.render.camera import PinholeCamera
 from tflane_jax.world.roads.markers import PlacementConfig, Visible, approaching, marker_pose
 
 
@@ -61,7 +61,7 @@ class SegmentFrame:
 
     timestamp_ns: int
     lanes: FrameLanes
-    cameras: tuple[FrontCamera, ...]
+    cameras: tuple[PinholeCamera, ...]
 
 
 def segment_frame(
@@ -82,7 +82,7 @@ def segment_frame(
         ids = lane_ids(file.annotation, names, where)
         lanes = FrameLanes(pose, ids, found.lines, found.is_connector, found.successor)
     cameras = [
-        FrontCamera(*size, camera.intrinsics, invert_pose(camera.ego_from_camera))
+        PinholeCamera(*size, camera.intrinsics, invert_pose(camera.ego_from_camera))
         for camera, size in zip(file.cameras, sizes, strict=True)
         if camera is not None and size is not None
     ]
@@ -176,7 +176,7 @@ def _log(name: str, frames: Sequence[SegmentFrame], vector_map: VectorMap, seed:
     )
 
 
-def _seen_by(poses: Float[np.ndarray, "f 4 4"], cameras: Sequence[tuple[FrontCamera, ...]], size: float) -> Visible:
+def _seen_by(poses: Float[np.ndarray, "f 4 4"], cameras: Sequence[tuple[PinholeCamera, ...]], size: float) -> Visible:
     """Return the function that says in which fraction of the frames that approach a board it lies in an image."""
 
     def visible(place: Float[np.ndarray, "3"], heading: float) -> float:

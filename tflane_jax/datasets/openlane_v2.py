@@ -8,7 +8,7 @@ virtual markers (`openlane_markers`) and the official SD map (`openlane_sd_map`)
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import KW_ONLY, dataclass, field, replace
 from functools import cached_property
 from itertools import takewhile
 from pathlib import Path
@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float
 
 from tflane_jax.datasets.base import ExampleConfig, FrameInfo, Split
-from tflane_jax.datasets.data_source import Choice, DataSource, FolderCheck
+from tflane_jax.datasets.data_source import Choice, DataSource, FolderCheck, split_config
 from tflane_jax.datasets.openlane_annotation import read_annotation
 from tflane_jax.datasets.openlane_can_bus import CanBus, vehicle_state
 from tflane_jax.datasets.openlane_check import check_openlane_v2
@@ -55,12 +55,11 @@ OPENLANE_V2_SIZES = ExampleConfig(lanes=128, segments=192, areas=64, elements=48
 
 
 @dataclass(frozen=True)
-class OpenLaneV2Config:
-    """Which frames, and how they become examples.
+class OpenLaneV2Settings:
+    """How frames become examples: the settings of one split and of a run have these in common.
 
     Attributes:
         root: folder of the dataset.
-        split: the official test split has no annotations, so its examples have no valid lane.
         subset: A is from Argoverse 2 (7 cameras), B from nuScenes (6 cameras).
         flavour: which files are read: "centerline" (`Example.lanes`), "lane_segment" (`Example.segments` and areas), or
             "both". Traffic elements come from the centerline files if these are read: the rows of
@@ -82,7 +81,7 @@ class OpenLaneV2Config:
     """
 
     root: Path
-    split: Split = "train"
+    _: KW_ONLY
     subset: SubsetName = "A"
     flavour: Flavour = "centerline"
     data_dict: str | None = None
@@ -94,6 +93,17 @@ class OpenLaneV2Config:
     without_tracks: WithoutTracks = "refuse"
     boards: BoardsConfig = BoardsConfig()
     can_bus: CanBus = "none"
+
+
+@dataclass(frozen=True)
+class OpenLaneV2Config(OpenLaneV2Settings):
+    """One split.
+
+    Attributes:
+        split: the official test split has no annotations, so its examples have no valid lane.
+    """
+
+    split: Split = "train"
 
 
 class OpenLaneV2Dataset:
@@ -275,42 +285,25 @@ def _blank(config: OpenLaneV2Config, views: CameraViews | None) -> Example:
 
 
 @dataclass(frozen=True)
-class OpenLaneV2Data:
-    """OpenLane-V2, or any dataset in its layout, read from disk while training.
+class OpenLaneV2Data(OpenLaneV2Settings):
+    """OpenLane-V2, or any dataset in its layout, read from disk while training; `map_changes` is of the training split.
 
     Attributes:
-        root: folder of the dataset.
         train, val, test: which official split serves as each; the official test split has no annotations.
-        subset, flavour, data_dict, image, example, loading: see `OpenLaneV2Config`.
+        image: scaling and cropping of the images, which training needs.
         augmentation: of training images, or None.
-        map_changes: whether the training split keeps or drops logs whose streets differ from their map, as
-            `OpenLaneV2Config.map_changes`.
-        tracks, without_tracks: traffic flow, see `OpenLaneV2Config`.
-        boards, can_bus: see `OpenLaneV2Config`.
     """
 
-    root: Path
     train: Split = "train"
     val: Split = "val"
     test: Split = "val"
-    subset: SubsetName = "A"
-    flavour: Flavour = "centerline"
-    data_dict: str | None = None
-    image: ImageConfig = TOPONET_SUBSET_A
-    example: ExampleConfig = OPENLANE_V2_SIZES
+    image: ImageConfig = field(default=TOPONET_SUBSET_A, kw_only=True)
     augmentation: PhotometricConfig | None = PhotometricConfig()
-    loading: StreamingConfig = StreamingConfig()
-    map_changes: Literal["keep", "drop"] = "keep"
-    tracks: Path | None = None
-    without_tracks: WithoutTracks = "refuse"
-    boards: BoardsConfig = BoardsConfig()
-    can_bus: CanBus = "none"
 
     def source(self, split: Split) -> OpenLaneV2Config:
         """Return the dataset of a split."""
-        shared = {field.name: getattr(self, field.name) for field in fields(OpenLaneV2Config) if field.name != "split"}
-        changes = self.map_changes if split == "train" else "keep"
-        return OpenLaneV2Config(**shared | {"split": getattr(self, split), "map_changes": changes})
+        map_changes = self.map_changes if split == "train" else "keep"
+        return split_config(OpenLaneV2Config, self, split=getattr(self, split), map_changes=map_changes)
 
 
 def _sample(config: OpenLaneV2Config) -> Example:
@@ -323,7 +316,7 @@ def _choose(choice: Choice) -> OpenLaneV2Config:
         return replace(choice.configured, root=choice.root)
     subset = subset_of(choice.root)
     image = TOPONET_SUBSET_A if subset == "A" else TOPONET_SUBSET_B
-    return OpenLaneV2Config(choice.root, choice.split, subset, image=image, example=choice.configured.example)
+    return OpenLaneV2Config(choice.root, choice.split, subset=subset, image=image, example=choice.configured.example)
 
 
 def _check(root: Path, tracks: Path | None = None, images: Images = "ends") -> FolderCheck:

@@ -86,7 +86,13 @@ def segment_confidences(
     detected: Sequence[Float[np.ndarray, "p m 3"]],
     scores: Float[np.ndarray, " p"],
 ) -> Float[np.ndarray, " g"]:
-    """Return the same for segments: centerlines, left and right lines of both sides."""
+    """Return for each true segment the highest confidence of the detections that find it; -inf without one.
+
+    Args:
+        truth: centerlines, left and right boundaries of the valid segments of one frame, metres.
+        detected: the same of all detections.
+        scores: confidence of each detection.
+    """
     return highest_confidences(*nearest_segments(list(truth), list(detected)), scores, len(truth[0]))
 
 

@@ -23,7 +23,7 @@ from tflane_jax.scene.logs import KeyFrame, LaneSegment, Log, PlacedMarkers, Tra
 from tflane_jax.scene.marker_patterns import marker_count
 from tflane_jax.world.cameras.ring import ARGOVERSE2_RING, CameraMount, CameraRigConfig, draw_rig
 from tflane_jax.world.cameras.sensor import render_window
-from tflane_jax.world.render.camera import FrontCamera
+from tflane_jax.world.render.camera import PinholeCamera
 
 # Margin around a board in the rendered window, pixels, in addition to half the size of the board.
 _AROUND = 24
@@ -112,7 +112,7 @@ class _Image:
 
     pixels: UInt8[np.ndarray, "h w 3"]
     corner: tuple[int, int]
-    camera: FrontCamera
+    camera: PinholeCamera
     boards: list[tuple[int, Float[np.ndarray, "4 4"], float, Float[np.ndarray, "4 2"]]]
     seed: int
     distance: float
@@ -156,14 +156,14 @@ def _sides(outline: Float[np.ndarray, "*b 4 2"]) -> Float[np.ndarray, "*b"]:
     return np.linalg.norm(outline - np.roll(outline, 1, -2), axis=-1).mean(-1)
 
 
-def _in_image(outlines: Float[np.ndarray, "b 4 2"], camera: FrontCamera) -> Bool[np.ndarray, " b"]:
+def _in_image(outlines: Float[np.ndarray, "b 4 2"], camera: PinholeCamera) -> Bool[np.ndarray, " b"]:
     """Return which boards lie in the image with their margin."""
     margin = 0.3 * _sides(outlines)[:, None, None]
     size = np.array([camera.width, camera.height])
     return np.asarray(((outlines > margin) & (outlines < size - margin)).all((1, 2)))
 
 
-def _window(outlines: Float[np.ndarray, "b 4 2"], camera: FrontCamera) -> tuple[tuple[int, int], tuple[int, int]]:
+def _window(outlines: Float[np.ndarray, "b 4 2"], camera: PinholeCamera) -> tuple[tuple[int, int], tuple[int, int]]:
     """Return corner and size of the part of the image that shows these boards."""
     around = _AROUND + 0.5 * _sides(outlines).max()
     low = np.maximum(np.floor(outlines.min((0, 1)) - around), 0.0).astype(int)
@@ -175,7 +175,7 @@ def _window(outlines: Float[np.ndarray, "b 4 2"], camera: FrontCamera) -> tuple[
 def _compared(
     sight: Sighting,
     corners: Float[np.ndarray, "4 2"],
-    camera: FrontCamera,
+    camera: PinholeCamera,
     ego_from_marker: Float[np.ndarray, "4 4"],
     detector: DetectorConfig,
 ) -> Sighting:

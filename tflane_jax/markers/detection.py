@@ -81,7 +81,15 @@ def locate(
     config: DetectorConfig = DetectorConfig(),
     sizes: Mapping[int, float] | None = None,
 ) -> DetectedMarkers:
-    """Return what `detect` does, from what was found in each valid view."""
+    """Return the markers of a frame from what was found in its images; an id found several times is reported once.
+
+    The one with the best score is reported.
+
+    Args:
+        views: of the frame; only calibration and validity are used.
+        found: corners and ids in each valid view, in the order of the views.
+        config, sizes: see `detect`.
+    """
     sightings: dict[int, list[_Sighting]] = {}
     for number, in_image in zip(_valid(views), found, strict=True):
         intrinsics = np.asarray(views.intrinsics[number], np.float64)

@@ -21,7 +21,7 @@ from tflane_jax.scene import CameraViews
 from tflane_jax.scene.logs import KeyFrame, Log, PlacedMarkers
 from tflane_jax.world.cameras.ring import ARGOVERSE2_RING, CameraRigConfig, draw_rig
 from tflane_jax.world.cameras.sensor import render_window
-from tflane_jax.world.render.camera import FrontCamera
+from tflane_jax.world.render.camera import PinholeCamera
 
 # Around a board, pixels, in addition to its own width; a board whose face is turned away farther cannot be read.
 _AROUND, _FACING = 24, np.cos(np.deg2rad(80.0))
@@ -87,7 +87,7 @@ def detect_in_world(
 
 
 def _window(
-    pose: Float[np.ndarray, "4 4"], size: float, camera: FrontCamera, detector: DetectorConfig
+    pose: Float[np.ndarray, "4 4"], size: float, camera: PinholeCamera, detector: DetectorConfig
 ) -> tuple[tuple[int, int], tuple[int, int]] | None:
     """Return corner and size of the part of the image around a board, None where it cannot be read."""
     seen = camera.camera_from_ego @ pose
@@ -109,7 +109,7 @@ def _shifted(found: ImageMarkers, corner: tuple[int, int]) -> ImageMarkers:
     return found._replace(corners=found.corners + np.array(corner))
 
 
-def _empty_views(cameras: tuple[FrontCamera, ...]) -> CameraViews:
+def _empty_views(cameras: tuple[PinholeCamera, ...]) -> CameraViews:
     """Return the calibration of the cameras, without pixels."""
     return CameraViews(
         image=np.zeros((len(cameras), 1, 1, 3), np.uint8),

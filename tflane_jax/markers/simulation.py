@@ -22,7 +22,7 @@ from tflane_jax.scene.logs import KeyFrame, Log, PlacedMarkers
 from tflane_jax.world.bev.line_of_sight import hidden_points
 from tflane_jax.world.cameras.ring import ARGOVERSE2_RING, CameraMount
 from tflane_jax.world.cameras.stage import static_boxes
-from tflane_jax.world.render.camera import FrontCamera
+from tflane_jax.world.render.camera import PinholeCamera
 
 ROOT = 20_251_123
 
@@ -140,7 +140,7 @@ def simulate_detections(
     markers: PlacedMarkers,
     config: MarkerSimulationConfig,
     *,
-    cameras: Sequence[FrontCamera] | None = None,
+    cameras: Sequence[PinholeCamera] | None = None,
 ) -> SimulatedMarkers:
     """Return which markers are detected at a moment of a log, and their noisy poses.
 

@@ -12,7 +12,7 @@ from tflane_jax.markers.square_pose import marker_outline
 from tflane_jax.scene.logs import KeyFrame, Log
 from tflane_jax.world.bev.line_of_sight import hidden_points, occluders_from
 from tflane_jax.world.cameras.ring import CameraMount, CameraRigConfig, draw_rig
-from tflane_jax.world.render.camera import FrontCamera
+from tflane_jax.world.render.camera import PinholeCamera
 
 # Points of a square of side 1 at which it is looked at: the middles of 7 x 7 cells.
 _CELLS = (np.arange(7) + 0.5) / 7.0 - 0.5
@@ -56,7 +56,7 @@ def seen_fraction(
     return best
 
 
-def in_image(ego_from_marker: Float[np.ndarray, "m 4 4"], size: float, camera: FrontCamera) -> Bool[np.ndarray, " m"]:
+def in_image(ego_from_marker: Float[np.ndarray, "m 4 4"], size: float, camera: PinholeCamera) -> Bool[np.ndarray, " m"]:
     """Return which squares lie in an image as a whole."""
     depth = (camera.camera_from_ego @ ego_from_marker)[:, 2, 3]
     inside = np.zeros(len(depth), bool)
@@ -67,7 +67,7 @@ def in_image(ego_from_marker: Float[np.ndarray, "m 4 4"], size: float, camera: F
 
 
 def in_images(
-    ego_from_marker: Float[np.ndarray, "m 4 4"], size: float, cameras: Sequence[FrontCamera]
+    ego_from_marker: Float[np.ndarray, "m 4 4"], size: float, cameras: Sequence[PinholeCamera]
 ) -> Bool[np.ndarray, " m"]:
     """Return which squares lie as a whole in an image of one of the cameras."""
     nowhere = np.zeros(len(ego_from_marker), bool)

@@ -157,7 +157,13 @@ class LiftEncoder(nn.Module):
     def lift(
         self, features: Float[Array, "v h w c"], cameras: CameraViews, *, train: bool, fuse: BevHook | None = None
     ) -> tuple[Float[Array, "y x c"], Float[Array, "v h w d"]]:
-        """Return what `encode` does, from calibrated cameras."""
+        """Return BEV features and depth logits, from feature maps and the calibration of their cameras.
+
+        Args:
+            features: of V cameras; those of an invalid camera may be anything.
+            cameras: calibration and validity; of the images, only the shape is used.
+            train, fuse: see `encode`.
+        """
         size, shape = cameras.image.shape[1:3], (features.shape[1], features.shape[2])
         there = jnp.asarray(cameras.valid)
         valid = there[:, None, None]

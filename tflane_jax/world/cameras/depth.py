@@ -14,7 +14,7 @@ from tflane_jax.geometry import invert_pose
 from tflane_jax.world.cameras.faces import faces_of
 from tflane_jax.world.cameras.solids import Bodies, polygon_starts, with_blobs
 from tflane_jax.world.cameras.surface import Surface
-from tflane_jax.world.render.camera import NEAR, FrontCamera
+from tflane_jax.world.render.camera import NEAR, PinholeCamera
 from tflane_jax.world.render.polygons import SHIFT, clipped, fixed_point
 
 # Samples along each side of a cell.
@@ -24,7 +24,7 @@ _FAR = 130.0
 
 
 def render_depth(
-    bodies: Bodies, camera: FrontCamera, cell: int, surface: Surface | None = None
+    bodies: Bodies, camera: PinholeCamera, cell: int, surface: Surface | None = None
 ) -> tuple[Float[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
     """Return the depth of the nearest surface in each cell, metres along the optical axis, and where there is one.
 
@@ -58,7 +58,7 @@ def render_depth(
     return np.where(valid, 1.0 / np.where(valid, nearest, 1.0), 0.0), valid
 
 
-def _add_bodies(inverse: Float[np.ndarray, "h w"], bodies: Bodies, camera: FrontCamera) -> None:
+def _add_bodies(inverse: Float[np.ndarray, "h w"], bodies: Bodies, camera: PinholeCamera) -> None:
     """Raise the inverse depth of the pixels that bodies cover (in place): no order, the nearest surface stays."""
     import cv2
 

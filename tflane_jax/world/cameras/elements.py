@@ -14,7 +14,7 @@ from tflane_jax.geometry import invert_pose
 from tflane_jax.scene.logs import MapElement
 from tflane_jax.world.bev.line_of_sight import hidden_points, occluders_from
 from tflane_jax.world.cameras.solids import Bodies, Box, pack
-from tflane_jax.world.render.camera import NEAR, FrontCamera
+from tflane_jax.world.render.camera import NEAR, PinholeCamera
 from tflane_jax.world.render.polygons import Solid
 from tflane_jax.world.render.shapes import Colour, box
 from tflane_jax.world.roads.traffic_control import (
@@ -136,7 +136,7 @@ def mast_bodies(elements: Sequence[MapElement], boundaries: Sequence[Float[np.nd
 
 
 def element_boxes(
-    elements: Sequence[MapElement], ego_from_global: Float[np.ndarray, "4 4"], camera: FrontCamera
+    elements: Sequence[MapElement], ego_from_global: Float[np.ndarray, "4 4"], camera: PinholeCamera
 ) -> tuple[Float[np.ndarray, "e 2 2"], Bool[np.ndarray, " e"]]:
     """Return the pixel box of each element, cut at the image border, and which are in the image and face the camera.
 
@@ -157,7 +157,7 @@ def element_boxes(
 def unhidden(
     elements: Sequence[MapElement],
     ego_from_global: Float[np.ndarray, "4 4"],
-    camera: FrontCamera,
+    camera: PinholeCamera,
     boxes: Float[np.ndarray, "b 7"],
     own: int,
 ) -> Bool[np.ndarray, " e"]:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from tflane_jax.world.render.camera import NEAR, FrontCamera
+from tflane_jax.world.render.camera import NEAR, PinholeCamera
 
 
 class Faces(NamedTuple):
@@ -36,7 +36,7 @@ class Faces(NamedTuple):
 
 
 def faces_of(
-    corners: Float[np.ndarray, "c 3"], starts: Int[np.ndarray, " f"], camera: FrontCamera, eye: Float[np.ndarray, "3"]
+    corners: Float[np.ndarray, "c 3"], starts: Int[np.ndarray, " f"], camera: PinholeCamera, eye: Float[np.ndarray, "3"]
 ) -> Faces:
     """Return polygons as a camera sees them.
 

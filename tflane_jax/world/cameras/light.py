@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from tflane_jax.geometry import invert_pose
 from tflane_jax.world.cameras.solids import footprints
-from tflane_jax.world.render.camera import NEAR, FrontCamera, lift
+from tflane_jax.world.render.camera import NEAR, PinholeCamera, lift
 from tflane_jax.world.render.noise import noise_tile
 from tflane_jax.world.render.polygons import HEADLIGHTS, SHIFT, clipped, fixed_point
 from tflane_jax.world.render.weather import FrontWeatherConfig, Weather, draw_weather
@@ -100,7 +100,7 @@ class View:
             scene.
     """
 
-    camera: FrontCamera
+    camera: PinholeCamera
     azimuth: Float[np.ndarray, "H W"]
     elevation: Float[np.ndarray, "H W"]
     first_row: int
@@ -117,7 +117,7 @@ class View:
 FAR = 500.0
 
 
-def look(camera: FrontCamera) -> View:
+def look(camera: PinholeCamera) -> View:
     """Return the rays and ground points of a camera's pixels."""
     w, h = camera.width, camera.height
     u, v = np.arange(w) + 0.5, (np.arange(h) + 0.5)[:, None]
@@ -234,7 +234,7 @@ def vehicle_shadows(
     return cv2.GaussianBlur(sunny, blur, 0) * scale, cv2.GaussianBlur(open_sky, blur, 0) * scale
 
 
-def _may_be_seen(camera: FrontCamera, boxes: Float[np.ndarray, "b 7"]) -> Bool[np.ndarray, " b"]:
+def _may_be_seen(camera: PinholeCamera, boxes: Float[np.ndarray, "b 7"]) -> Bool[np.ndarray, " b"]:
     """Return which bodies may cast a shadow into the image: those not far beyond its left and right borders."""
     local = boxes[:, :3] * [1.0, 1.0, 0.0] @ camera.camera_from_ego[:3, :3].T + camera.camera_from_ego[:3, 3]
     margin = boxes[:, 2] + boxes[:, 6] / _STEEPEST_SHADOW

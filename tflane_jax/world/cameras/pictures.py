@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from tflane_jax.world.render.camera import NEAR, FrontCamera
+from tflane_jax.world.render.camera import NEAR, PinholeCamera
 
 # Samples per pixel along each side, least and most; target number of samples of a small pattern, and largest number of
 # samples of a large one.
@@ -20,7 +20,7 @@ def paint_picture(
     image: UInt8[np.ndarray, "h w 3"],
     corners: Float[np.ndarray, "4 3"],
     picture: Float[np.ndarray, "r c"],
-    camera: FrontCamera,
+    camera: PinholeCamera,
     tones: Float[np.ndarray, "2 3"],
 ) -> None:
     """Draw a pattern in perspective, in place; one that reaches nearer than `NEAR` is skipped.

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from tflane_jax.limits import NOT_EMPTY, Count, Fraction, Positive, PositiveOrZero, Rules, check_settings
-from tflane_jax.world.render.camera import FrontCamera, camera_pose
+from tflane_jax.world.render.camera import PinholeCamera, camera_pose
 from tflane_jax.world.render.weather import FrontWeatherConfig
 
 ROOT = 20_251_121
@@ -115,7 +115,7 @@ class CameraRigConfig:
 
 
 @functools.lru_cache(maxsize=16)
-def draw_rig(seed: int, config: CameraRigConfig) -> tuple[FrontCamera, ...]:
+def draw_rig(seed: int, config: CameraRigConfig) -> tuple[PinholeCamera, ...]:
     """Return the calibrated cameras of a scene, one for each mount.
 
     A camera depends on the seed, its own mount, scale, multiple and jitter alone, not on the other cameras.
@@ -129,7 +129,7 @@ def camera_stream(seed: int, mount: CameraMount, *more: int) -> np.random.Genera
     return np.random.default_rng([ROOT, seed, zlib.crc32(mount.name.encode()), *more])
 
 
-def _draw_camera(seed: int, mount: CameraMount, config: CameraRigConfig) -> FrontCamera:
+def _draw_camera(seed: int, mount: CameraMount, config: CameraRigConfig) -> PinholeCamera:
     focal, u, v, dx, dy, dz, yaw, pitch, roll = config.jitter * camera_stream(seed, mount).standard_normal(9)
     angles = np.deg2rad([mount.yaw + _ANGLE * yaw, mount.pitch + _ANGLE * pitch, _ANGLE * roll])
     pose = camera_pose(0.0, angles[1], angles[0], angles[2])
@@ -138,12 +138,14 @@ def _draw_camera(seed: int, mount: CameraMount, config: CameraRigConfig) -> Fron
     centre = 0.5 * np.array([mount.width, mount.height]) + _CENTRE * mount.focal * np.array([u, v])
     length = mount.focal * (1.0 + _FOCAL * focal)
     native = np.array([[length, 0.0, centre[0]], [0.0, length, centre[1]], [0.0, 0.0, 1.0]])
-    return FrontCamera(*config.size(mount), np.diag([*scale, 1.0]) @ native, pose)
+    return PinholeCamera(*config.size(mount), np.diag([*scale, 1.0]) @ native, pose)
 
 
-def enlarged(camera: FrontCamera, factor: int) -> FrontCamera:
+def enlarged(camera: PinholeCamera, factor: int) -> PinholeCamera:
     """Return the camera with `factor` times as many pixels along both sides."""
     if factor == 1:
         return camera
     scale: Float[np.ndarray, "3 3"] = np.diag([float(factor), float(factor), 1.0])
-    return FrontCamera(factor * camera.width, factor * camera.height, scale @ camera.intrinsics, camera.camera_from_ego)
+    return PinholeCamera(
+        factor * camera.width, factor * camera.height, scale @ camera.intrinsics, camera.camera_from_ego
+    )

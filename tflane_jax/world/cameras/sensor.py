@@ -26,7 +26,7 @@ from tflane_jax.world.cameras.moment import NEAR_REACH, Moment, attributes_at, i
 from tflane_jax.world.cameras.ring import CameraRigConfig, camera_stream, draw_rig, enlarged
 from tflane_jax.world.cameras.solids import draw_bodies
 from tflane_jax.world.cameras.stage import SHADE_TEXEL, Stage, Stream, stage_of
-from tflane_jax.world.render.camera import FrontCamera
+from tflane_jax.world.render.camera import PinholeCamera
 from tflane_jax.world.render.exposure import develop
 from tflane_jax.world.render.weather import Weather
 
@@ -159,11 +159,11 @@ def visible_elements(log: Log, keyframe: int, config: CameraRigConfig) -> Elemen
 @functools.lru_cache(maxsize=32)
 def _cached_view(pixels: tuple[int, int, int], intrinsics: bytes, pose: bytes) -> View:
     width, height, factor = pixels
-    camera = FrontCamera(width, height, np.frombuffer(intrinsics).reshape(3, 3), np.frombuffer(pose).reshape(4, 4))
+    camera = PinholeCamera(width, height, np.frombuffer(intrinsics).reshape(3, 3), np.frombuffer(pose).reshape(4, 4))
     return look(enlarged(camera, factor))
 
 
-def _view(camera: FrontCamera, factor: int, moment: Moment) -> View:
+def _view(camera: PinholeCamera, factor: int, moment: Moment) -> View:
     """Return the rays and ground points of an enlarged camera; on level ground, the last few small ones are cached."""
     if moment.surface is not None:
         return moment.surface.look(enlarged(camera, factor))
@@ -222,7 +222,7 @@ def _ground_colour(moment: Moment, view: View, x: np.ndarray, y: np.ndarray) -> 
 
 
 def _develop(
-    rng: np.random.Generator, picture: UInt8[np.ndarray, "H W 3"], camera: FrontCamera, weather: Weather, longest: int
+    rng: np.random.Generator, picture: UInt8[np.ndarray, "H W 3"], camera: PinholeCamera, weather: Weather, longest: int
 ) -> UInt8[np.ndarray, "h w 3"]:
     """Return the delivered image at its own size; `longest` is the longer side of the camera's whole image."""
     import cv2

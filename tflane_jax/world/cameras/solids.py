@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from tflane_jax.geometry import invert_pose
 from tflane_jax.world.cameras.faces import faces_of
 from tflane_jax.world.cameras.pictures import paint_picture
-from tflane_jax.world.render.camera import FrontCamera
+from tflane_jax.world.render.camera import PinholeCamera
 from tflane_jax.world.render.polygons import HEADLIGHTS, SHIFT, Solid, clipped, fixed_point
 from tflane_jax.world.render.weather import Weather
 
@@ -147,7 +147,7 @@ def join(groups: Sequence[Bodies]) -> Bodies:
 def draw_bodies(
     image: UInt8[np.ndarray, "h w 3"],
     bodies: Bodies,
-    camera: FrontCamera,
+    camera: PinholeCamera,
     weather: Weather,
     edges: Literal["smooth", "hard"] = "smooth",
 ) -> None:

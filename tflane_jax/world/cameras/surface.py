@@ -17,7 +17,7 @@ from tflane_jax.scene.logs import Log
 from tflane_jax.scene.terrain import Terrain
 from tflane_jax.world.cameras.light import View
 from tflane_jax.world.cameras.solids import Bodies
-from tflane_jax.world.render.camera import FrontCamera
+from tflane_jax.world.render.camera import PinholeCamera
 
 # Distances along a ray at which it is compared with the ground: from one to the next by a fifteenth, metres.
 _NEAREST, _FARTHEST, _GROWTH = 0.5, 250.0, 1.07
@@ -75,7 +75,7 @@ class Surface:
             level.pictures,
         )
 
-    def hits(self, camera: FrontCamera) -> tuple[Float[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"], np.ndarray]:
+    def hits(self, camera: PinholeCamera) -> tuple[Float[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"], np.ndarray]:
         """Return where the rays of a camera's pixels first meet the ground, level frame, and which do.
 
         The third result are the rays (h, w, 3), level frame; all are float32.
@@ -104,7 +104,7 @@ class Surface:
         place = eye + reach[..., None] * ray
         return place, seen, ray
 
-    def look(self, camera: FrontCamera) -> View:
+    def look(self, camera: PinholeCamera) -> View:
         """Return the rays and ground points of a camera's pixels, as `light.look` does for level ground.
 
         Ground points are those of the level scene; azimuth and elevation are against the horizon.
@@ -130,7 +130,7 @@ class Surface:
         )
 
     def depth(
-        self, camera: FrontCamera, place: Float[np.ndarray, "h w 3"], seen: Bool[np.ndarray, "h w"]
+        self, camera: PinholeCamera, place: Float[np.ndarray, "h w 3"], seen: Bool[np.ndarray, "h w"]
     ) -> Float[np.ndarray, "h w"]:
         """Return the depth of hits along the optical axis, metres; that of pixels without ground is the farthest."""
         axis = (camera.camera_from_ego @ self.ego_from_level)[2]

@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from tflane_jax.world.front_view.ground import Ground
 from tflane_jax.world.front_view.road import Highway, Stripe
-from tflane_jax.world.render.camera import FrontCamera, lift
+from tflane_jax.world.render.camera import PinholeCamera, lift
 from tflane_jax.world.render.polygons import SHIFT, fixed_point
 
 TRACK = 0.85  # half the distance between the wheels of a car, metres
@@ -46,7 +46,7 @@ def _window(s: np.ndarray, start: float, length: float) -> np.ndarray:
 def draw_stains(
     rng: np.random.Generator,
     colour: Float[np.ndarray, "3 h w"],
-    camera: FrontCamera,
+    camera: PinholeCamera,
     road: Highway,
     ground: Ground,
     dirt: float,

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from tflane_jax.world.front_view.road import Highway
-from tflane_jax.world.render.camera import FrontCamera, lift
+from tflane_jax.world.render.camera import PinholeCamera, lift
 from tflane_jax.world.roads.curves import ReferenceLine
 
 # Road coordinates are computed in every such column and interpolated linearly in between.
@@ -44,7 +44,7 @@ class Ground:
 _BEYOND = 20_000.0
 
 
-def look_at_ground(camera: FrontCamera, axis: ReferenceLine) -> Ground:
+def look_at_ground(camera: PinholeCamera, axis: ReferenceLine) -> Ground:
     """Return the ground seen at each pixel."""
     knots = np.arange(0, camera.width + _COLUMNS, _COLUMNS) + 0.5
     horizon = camera.horizon_rows(np.array([0.0, camera.width])).min()
@@ -96,7 +96,7 @@ def road_coordinates(
 
 
 def image_columns(
-    camera: FrontCamera, road: Highway, offset: Float[np.ndarray, " n"], rows: Float[np.ndarray, " r"], reach: float
+    camera: PinholeCamera, road: Highway, offset: Float[np.ndarray, " n"], rows: Float[np.ndarray, " r"], reach: float
 ) -> tuple[Float[np.ndarray, " r"], Float[np.ndarray, " r"]]:
     """Return where a line along the road crosses image rows: columns and stations.
 

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 from tflane_jax.scene import LaneLines
 from tflane_jax.world.front_view.ground import image_columns
 from tflane_jax.world.front_view.road import Highway
-from tflane_jax.world.render.camera import FrontCamera
+from tflane_jax.world.render.camera import PinholeCamera
 
 # TuSimple's rows, as fractions of the image's height: 160, 170, ..., 710 of 720.
 ROW_FRACTIONS = np.arange(160, 720, 10) / 720.0
@@ -20,7 +20,7 @@ _MOST = 5
 _FEWEST_POINTS = 3
 
 
-def label_lines(camera: FrontCamera, road: Highway, reach: float) -> LaneLines:
+def label_lines(camera: PinholeCamera, road: Highway, reach: float) -> LaneLines:
     """Return the lane lines in the image, left to right; occlusion, dashes and wear leave no gaps.
 
     Args:
@@ -57,7 +57,7 @@ def marked_lines(road: Highway) -> Int[np.ndarray, " k"]:
 
 
 def _points(
-    camera: FrontCamera, road: Highway, number: int, reach: float
+    camera: PinholeCamera, road: Highway, number: int, reach: float
 ) -> tuple[Float[np.ndarray, " p"], Bool[np.ndarray, " p"]]:
     """Return u (fraction of the width) of one line at `ROW_FRACTIONS`, and where it has a point."""
     u, s = image_columns(camera, road, road.lines[number], ROW_FRACTIONS * camera.height, reach)

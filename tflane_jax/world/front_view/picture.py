@@ -9,7 +9,7 @@ from tflane_jax.world.front_view.ground import FAR, Ground
 from tflane_jax.world.front_view.road import Highway
 from tflane_jax.world.front_view.roadside import Roadside
 from tflane_jax.world.front_view.traffic import FrontTraffic, ground_shadows
-from tflane_jax.world.render.camera import NEAR, FrontCamera, lift
+from tflane_jax.world.render.camera import NEAR, PinholeCamera, lift
 from tflane_jax.world.render.noise import noise_tile
 from tflane_jax.world.render.polygons import HEADLIGHTS, SHIFT, fixed_point
 from tflane_jax.world.render.weather import Weather
@@ -20,7 +20,7 @@ def light_ground(
     traffic: FrontTraffic,
     roadside: Roadside,
     road: Highway,
-    camera: FrontCamera,
+    camera: PinholeCamera,
     ground: Ground,
     weather: Weather,
 ) -> None:
@@ -56,7 +56,7 @@ def show_ground(image: UInt8[np.ndarray, "h w 3"], colour: Float[np.ndarray, "3 
 
 
 def _shadows(
-    traffic: FrontTraffic, roadside: Roadside, road: Highway, camera: FrontCamera, ground: Ground, weather: Weather
+    traffic: FrontTraffic, roadside: Roadside, road: Highway, camera: PinholeCamera, ground: Ground, weather: Weather
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the fractions of direct and of ambient light that reach the ground (0 to 1)."""
     import cv2
@@ -92,7 +92,11 @@ def _shadows(
 
 
 def _fill(
-    mask: UInt8[np.ndarray, "h w"], ring: Float[np.ndarray, "k 2"], camera: FrontCamera, offset: np.ndarray, value: int
+    mask: UInt8[np.ndarray, "h w"],
+    ring: Float[np.ndarray, "k 2"],
+    camera: PinholeCamera,
+    offset: np.ndarray,
+    value: int,
 ) -> None:
     """Fill a polygon on the ground."""
     import cv2
@@ -106,7 +110,7 @@ def _fill(
         cv2.fillPoly(mask, [fixed_point(pixels - offset)], value, cv2.LINE_AA, SHIFT)
 
 
-def draw_backdrop(rng: np.random.Generator, camera: FrontCamera, weather: Weather) -> UInt8[np.ndarray, "h w 3"]:
+def draw_backdrop(rng: np.random.Generator, camera: PinholeCamera, weather: Weather) -> UInt8[np.ndarray, "h w 3"]:
     """Return an image of the sky with clouds and the sun's glow, and of hills and woods on the horizon."""
     import cv2
 
@@ -128,7 +132,7 @@ def draw_backdrop(rng: np.random.Generator, camera: FrontCamera, weather: Weathe
     return image
 
 
-def _sky(rng: np.random.Generator, camera: FrontCamera, weather: Weather) -> UInt8[np.ndarray, "k l 3"]:
+def _sky(rng: np.random.Generator, camera: PinholeCamera, weather: Weather) -> UInt8[np.ndarray, "k l 3"]:
     """Return the sky at a quarter of the image's size."""
     import cv2
 

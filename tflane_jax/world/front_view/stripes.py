@@ -7,11 +7,11 @@ from jaxtyping import Float, Int
 
 from tflane_jax.world.front_view.ground import FAR, Ground, image_columns
 from tflane_jax.world.front_view.road import Highway, Stripe
-from tflane_jax.world.render.camera import FrontCamera
+from tflane_jax.world.render.camera import PinholeCamera
 
 
 def draw_stripe(
-    colour: Float[np.ndarray, "3 h w"], stripe: Stripe, camera: FrontCamera, road: Highway, ground: Ground
+    colour: Float[np.ndarray, "3 h w"], stripe: Stripe, camera: PinholeCamera, road: Highway, ground: Ground
 ) -> None:
     """Blend a stripe into the ground's colours, weighted by the fraction of each pixel that it covers."""
     h, w = colour.shape[1:]

@@ -9,7 +9,7 @@ from tflane_jax.world.front_view.dirt import TRACK, dirt_stripes, draw_stains
 from tflane_jax.world.front_view.ground import Ground
 from tflane_jax.world.front_view.road import Beside, Highway
 from tflane_jax.world.front_view.stripes import draw_stripe
-from tflane_jax.world.render.camera import FrontCamera
+from tflane_jax.world.render.camera import PinholeCamera
 from tflane_jax.world.render.noise import TILE, noise_tile
 
 # Spacing of the tabulated colours across the road, and the largest offset on either side, metres.
@@ -18,7 +18,7 @@ _GRASS = ((0.30, 0.35, 0.18), (0.36, 0.38, 0.22), (0.42, 0.38, 0.26), (0.25, 0.3
 
 
 def paint_ground(
-    rng: np.random.Generator, camera: FrontCamera, road: Highway, ground: Ground, *, dirt: float, wet: float
+    rng: np.random.Generator, camera: PinholeCamera, road: Highway, ground: Ground, *, dirt: float, wet: float
 ) -> Float[np.ndarray, "3 h w"]:
     """Return the albedo of the ground (colours in full even light) for the rows of `ground`.
 

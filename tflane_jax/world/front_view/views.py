@@ -23,7 +23,7 @@ from tflane_jax.world.front_view.roadside import Roadside, draw_roadside
 from tflane_jax.world.front_view.surface import paint_ground
 from tflane_jax.world.front_view.traffic import FrontTraffic, FrontTrafficConfig, draw_traffic
 from tflane_jax.world.front_view.vehicles import vehicle_solids
-from tflane_jax.world.render.camera import FrontCamera, FrontCameraConfig, draw_camera
+from tflane_jax.world.render.camera import FrontCameraConfig, PinholeCamera, draw_camera
 from tflane_jax.world.render.exposure import develop
 from tflane_jax.world.render.polygons import draw_solids
 from tflane_jax.world.render.weather import FrontWeatherConfig, Weather, draw_weather
@@ -66,7 +66,7 @@ class FrontWorldConfig:
 class FrontScene:
     """The content of one image, in the ego frame."""
 
-    camera: FrontCamera
+    camera: PinholeCamera
     road: Highway
     traffic: FrontTraffic
     roadside: Roadside

@@ -1,4 +1,4 @@
-"""A pinhole camera above flat ground, as mounted behind a windscreen: projection, ground lookup, random mounting."""
+"""Pinhole cameras above flat ground: projection, ground lookup, random mounting of one behind a windscreen."""
 
 from __future__ import annotations
 
@@ -48,8 +48,8 @@ class FrontCameraConfig:
 
 
 @dataclass(frozen=True)
-class FrontCamera:
-    """One camera; the ego frame's origin lies on the ground below it.
+class PinholeCamera:
+    """One camera at a known pose in the ego frame, whose origin lies on the ground.
 
     Attributes:
         width, height: of the image, pixels.
@@ -109,7 +109,7 @@ def lift(xy: Float[np.ndarray, "k 2"], z: float = 0.0) -> Float[np.ndarray, "k 3
     return points
 
 
-def draw_camera(rng: np.random.Generator, config: FrontCameraConfig) -> FrontCamera:
+def draw_camera(rng: np.random.Generator, config: FrontCameraConfig) -> PinholeCamera:
     """Draw a camera; the same stream and config give the same bits."""
     scale = np.array([config.width / REFERENCE_WIDTH, config.height / REFERENCE_HEIGHT])
     focal = rng.uniform(*config.focal) * scale
@@ -119,7 +119,7 @@ def draw_camera(rng: np.random.Generator, config: FrontCameraConfig) -> FrontCam
     pitch = np.deg2rad(rng.uniform(*config.pitch))
     # Triangular: most cameras are mounted nearly straight.
     yaw, roll = np.deg2rad(rng.triangular(-1.0, 0.0, 1.0, 2) * [config.yaw, config.roll])
-    return FrontCamera(config.width, config.height, intrinsics, camera_pose(above, pitch, yaw, roll))
+    return PinholeCamera(config.width, config.height, intrinsics, camera_pose(above, pitch, yaw, roll))
 
 
 def camera_pose(above_ground: float, pitch: float, yaw: float = 0.0, roll: float = 0.0) -> Float[np.ndarray, "4 4"]:

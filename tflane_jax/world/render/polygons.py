@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from tflane_jax.world.render.camera import NEAR, FrontCamera
+from tflane_jax.world.render.camera import NEAR, PinholeCamera
 from tflane_jax.world.render.weather import Weather
 
 # cv2 takes corners as multiples of 1/16 pixel.
@@ -42,7 +42,7 @@ class Solid:
 
 
 def draw_solids(
-    image: UInt8[np.ndarray, "h w 3"], solids: Sequence[Solid], camera: FrontCamera, weather: Weather
+    image: UInt8[np.ndarray, "h w 3"], solids: Sequence[Solid], camera: PinholeCamera, weather: Weather
 ) -> None:
     """Draw solids into the image, the farthest first; polygons seen from behind are skipped."""
     import cv2

@@ -86,6 +86,14 @@ class HostQueries(NamedTuple):
     mask: Bool[Array, "q q"] | None = None
     groups: tuple[int, ...] = ()
 
+    def check(self, dim: int) -> None:
+        """Raise ValueError unless features and positions have `dim` channels, those of `HostSpec`."""
+        for name, found in (("features", self.features), ("position", self.position)):
+            if found.ndim != 2 or found.shape[1] != dim:
+                raise ValueError(
+                    f"{name} of the queries have shape {found.shape}, expected (Q, HostSpec.dim) = (Q, {dim})"
+                )
+
 
 class Prior:
     """A prior in one host; subclasses override the methods that they use.

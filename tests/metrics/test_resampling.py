@@ -1,6 +1,7 @@
 """Metrics of bootstrap samples against the same metrics of data sets in which scenes are really repeated."""
 
 import dataclasses
+from functools import partial
 from unittest import mock
 
 import numpy as np
@@ -10,13 +11,12 @@ from hypothesis import strategies as st
 
 from tests.metrics.cases import random_frame
 from tests.metrics.segments import random_segments
+from tflane_jax.errors import UserError
 from tflane_jax.metrics import (
     CenterlineMetrics,
     ElementDetections,
     ElementTruth,
-    GroupedCenterlineMetrics,
-    GroupedMapMetrics,
-    GroupedSegmentMetrics,
+    GroupedMetrics,
     LaneSegmentMetrics,
     MapConsistency,
     MapDetections,
@@ -121,12 +121,16 @@ def update_groups(metrics, number, make):
 GROUPS = {"frame_groups": ("near", "far"), "lane_groups": ("odd",)}
 CASES = {
     "centerlines": (lambda: CenterlineMetrics(("v2.1", "v1.0")), update, centerlines),
-    "centerlines, groups": (lambda: GroupedCenterlineMetrics(**GROUPS), update_groups, centerlines),
+    "centerlines, groups": (lambda: GroupedMetrics(CenterlineMetrics, **GROUPS), update_groups, centerlines),
     "segments": (lambda: LaneSegmentMetrics("LaneSegNet"), update, segments),
     "segments, devkit": (LaneSegmentMetrics, update, segments),
-    "segments, groups": (lambda: GroupedSegmentMetrics(**GROUPS), update_groups, segments),
+    "segments, groups": (
+        lambda: GroupedMetrics(partial(LaneSegmentMetrics, "LaneSegNet"), **GROUPS),
+        update_groups,
+        segments,
+    ),
     "lines": (VectorMapMetrics, update, lines),
-    "lines, groups": (lambda: GroupedMapMetrics(("all",), **GROUPS), update_groups, lines),
+    "lines, groups": (lambda: GroupedMetrics(VectorMapMetrics, ("all",), **GROUPS), update_groups, lines),
     "lines without centerlines": (VectorMapMetrics, update, lambda number: lines(number, centerlines=False)),
 }
 NAMES_OF = {
@@ -196,6 +200,16 @@ def test_consistency_of_samples():
     for b, times in enumerate(WEIGHTS):
         expected = run(np.repeat(np.arange(3), times)).compute()
         assert {name: values[b] for name, values in resampled.items()} == pytest.approx(expected, abs=1e-12)
+
+
+def test_elements_that_some_frames_lack_have_no_samples():
+    """Of their detections, the frames would be wrong."""
+    metrics = CenterlineMetrics()
+    detections, truth = centerlines(0)
+    metrics.update(dataclasses.replace(detections, elements=None), truth)
+    metrics.update(*centerlines(1))
+    with pytest.raises(UserError, match="traffic elements are missing in 1 of 2 frames"):
+        metrics.resampled(np.ones((1, 2), int))
 
 
 def test_means_are_the_scores():

@@ -5,7 +5,7 @@ import functools
 import numpy as np
 import pytest
 
-from tests.metrics.test_resampling import centerlines, lines, segments
+from tests.metrics.test_bootstrap import centerlines, lines, segments
 from tflane_jax.metrics import CenterlineFScore, CenterlineMetrics, LaneSegmentMetrics, VectorMapMetrics
 from tflane_jax.metrics.matching import average_precision_11, average_precision_area, ranked
 from tflane_jax.metrics.merging import by_frame, joined

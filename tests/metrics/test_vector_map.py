@@ -134,7 +134,7 @@ def test_a_class_that_a_part_lacks_does_not_count_there():
         truth = MapTruth(lines, classes, visibility=np.where(classes == 0, 0.1, 0.9))
         members = {"dividers": classes == 0, "none": classes == 1}
         metrics.update(MapDetections(lines, classes, np.full(len(lines), 0.9)), truth, group, members)
-    result, samples = metrics.compute(), metrics.resampled(np.array([[1, 1], [0, 1], [0, 0]]))
+    result, samples = metrics.compute(), metrics.bootstrap(np.array([[1, 1], [0, 1], [0, 0]]))
     whole = {name: value for name, value in result["all"].items() if "@" not in name}
     assert whole == {
         "frames": 2,

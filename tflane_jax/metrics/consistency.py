@@ -20,10 +20,10 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float, Int
 
+from tflane_jax.metrics.bootstrap import Weights, bootstrap_precisions, frame_numbers
 from tflane_jax.metrics.map_matching import CLASSES, MAP_THRESHOLDS, MatchedMap
 from tflane_jax.metrics.matching import average_precision_area, pooled
 from tflane_jax.metrics.merging import by_frame
-from tflane_jax.metrics.resampling import Weights, frame_numbers, resampled_precisions
 
 CONFIDENT = 0.4
 
@@ -84,13 +84,13 @@ class MapConsistency:
         means = {"C-mAP": np.mean(list(precision.values()))} | precision
         return {name: float(value) for name, value in means.items()}
 
-    def resampled(self, weights: Weights) -> dict[str, Float[np.ndarray, " b"]]:
+    def bootstrap(self, weights: Weights) -> dict[str, Float[np.ndarray, " b"]]:
         """Return the numbers of `compute` in samples that count the frames of a scene equally often, see `weights`."""
         scores, classes, hits = pooled(self._detections, (0,), (len(MAP_THRESHOLDS), 0))
         frame, truths = frame_numbers(self._detections), by_frame(self._frame_truths, (len(CLASSES),), int)
         precision = {}
         for c, name in enumerate(CLASSES):
             own = classes == c
-            _, area = resampled_precisions(scores[own], hits[:, own], frame[own], truths[:, c], weights)
+            _, area = bootstrap_precisions(scores[own], hits[:, own], frame[own], truths[:, c], weights)
             precision[f"C-AP_{name}"] = area.mean(1)
         return {"C-mAP": np.mean(list(precision.values()), axis=0)} | precision

@@ -24,9 +24,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from tflane_jax.errors import UserError
+from tflane_jax.metrics.bootstrap import Weights
 from tflane_jax.metrics.frames import Lines, check_shape
 from tflane_jax.metrics.merging import joined
-from tflane_jax.metrics.resampling import Weights
 
 COUNTS = ("frames", "lanes", "lines")
 """Numbers of a group that are no scores, but what its scores rest on."""
@@ -105,7 +105,7 @@ class LaneMetrics(Protocol):
         """Return the scores, recall aside, that are ratios of two sums over frames: the terms of both sums."""
         ...
 
-    def resampled(self, weights: Weights, scope: Scope = "all") -> dict[str, Float[np.ndarray, " b"]]:
+    def bootstrap(self, weights: Weights, scope: Scope = "all") -> dict[str, Float[np.ndarray, " b"]]:
         """Return the scores that rank detections, in samples that count the frames as often as `weights` says."""
         ...
 
@@ -296,13 +296,13 @@ class GroupedMetrics:
             for group, metrics in self._metrics.items()
         }
 
-    def resampled(self, weights: Weights) -> dict[str, dict[str, Float[np.ndarray, " b"]]]:
+    def bootstrap(self, weights: Weights) -> dict[str, dict[str, Float[np.ndarray, " b"]]]:
         """Return by group the scores that rank detections, in samples that count the frames as often as `weights` says.
 
-        The samples are exact, see `metrics.resampling`.
+        The samples are exact, see `metrics.bootstrap`.
         """
         return {
-            group: metrics.resampled(weights[:, np.array(self._measures[group], bool)], self._scope(group))
+            group: metrics.bootstrap(weights[:, np.array(self._measures[group], bool)], self._scope(group))
             for group, metrics in self._metrics.items()
         }
 

@@ -16,12 +16,12 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from tflane_jax.errors import UserError
+from tflane_jax.metrics.bootstrap import Weights, bootstrap_precisions, frame_numbers
 from tflane_jax.metrics.centerline_matching import LANE_THRESHOLDS
 from tflane_jax.metrics.groups import Scope
 from tflane_jax.metrics.matching import average_precision_11, pooled
 from tflane_jax.metrics.merging import by_frame, joined
 from tflane_jax.metrics.openlane_v2 import CenterlineMetrics, overall_score
-from tflane_jax.metrics.resampling import Weights, frame_numbers, resampled_precisions
 from tflane_jax.metrics.segment_matching import (
     AREA_THRESHOLDS,
     BOUNDARY,
@@ -130,13 +130,13 @@ class LaneSegmentMetrics:
         lanes = self._lanes.means()
         return {"TOP_lsls": lanes["TOP_ll"]} if self.flavour == "LaneSegNet" else lanes
 
-    def resampled(self, weights: Weights, scope: Scope = "all") -> dict[str, Float[np.ndarray, " b"]]:
+    def bootstrap(self, weights: Weights, scope: Scope = "all") -> dict[str, Float[np.ndarray, " b"]]:
         """Return AP, mAP, DET, TOP and OLUS of samples that count the frames as often as `weights` says."""
-        lanes = self._lanes.resampled(weights)
+        lanes = self._lanes.bootstrap(weights)
         scores, categories, hits = pooled(self._area_detections, (0,), (len(AREA_THRESHOLDS), 0))
         frame, truths = frame_numbers(self._area_detections), self._true_areas
         areas = {
-            name: list(resampled_precisions(scores[own], hits[:, own], frame[own], truths[:, category], weights)[0].T)
+            name: list(bootstrap_precisions(scores[own], hits[:, own], frame[own], truths[:, category], weights)[0].T)
             for name, category in _CATEGORIES.items()
             for own in [categories == category]
         }

@@ -17,12 +17,12 @@ from jaxtyping import Float, Int
 
 from tflane_jax.errors import UserError
 from tflane_jax.files.openlane import ATTRIBUTES
+from tflane_jax.metrics.bootstrap import Weights, bootstrap_mean, bootstrap_precisions, frame_numbers
 from tflane_jax.metrics.centerline_matching import LANE_THRESHOLDS, MatchedFrame, match_frame
 from tflane_jax.metrics.frames import LaneDetections, LaneTruth
 from tflane_jax.metrics.groups import Scope
 from tflane_jax.metrics.matching import average_precision_11, average_precision_area, pooled, ranked
 from tflane_jax.metrics.merging import by_frame, joined
-from tflane_jax.metrics.resampling import Weights, frame_numbers, resampled_mean, resampled_precisions
 from tflane_jax.metrics.topology import Version, check_versions
 
 
@@ -136,21 +136,21 @@ class CenterlineMetrics:
             for name, (sums, vertices) in self._vertices().items()
         }
 
-    def resampled(self, weights: Weights, scope: Scope = "all") -> dict[str, Float[np.ndarray, " b"]]:
+    def bootstrap(self, weights: Weights, scope: Scope = "all") -> dict[str, Float[np.ndarray, " b"]]:
         """Return DET, AP_l, TOP and OLS of samples that count the frames as often as `weights` says."""
         truths = self._truths
         scores, hits = pooled(self._lane_detections, (len(LANE_THRESHOLDS), 0))
         frame = frame_numbers(self._lane_detections)
-        eleven, area = resampled_precisions(scores, hits, frame, truths[:, 0], weights)
+        eleven, area = bootstrap_precisions(scores, hits, frame, truths[:, 0], weights)
         result = {"DET_l": eleven.mean(1), "AP_l": area.mean(1)}
-        result |= {name: resampled_mean(parts, weights) for name, parts in self.means().items()}
+        result |= {name: bootstrap_mean(parts, weights) for name, parts in self.means().items()}
         if not self._with_elements:
             return result
         scores, hits, attributes = pooled(self._element_detections, (0,), (0,))
         frame, precisions = frame_numbers(self._element_detections), []
         for i in range(ATTRIBUTES):
             own = attributes == i
-            eleven, _ = resampled_precisions(scores[own], hits[None, own], frame[own], truths[:, 2 + i], weights)
+            eleven, _ = bootstrap_precisions(scores[own], hits[None, own], frame[own], truths[:, 2 + i], weights)
             precisions.append(eleven[:, 0])
         result["DET_t"] = np.mean(precisions, axis=0)
         return result | self._overall(result)

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from tflane_jax.errors import UserError
+from tflane_jax.metrics.bootstrap import Weights, bootstrap_precisions, frame_numbers
 from tflane_jax.metrics.groups import Scope
 from tflane_jax.metrics.map_matching import (
     CLASSES,
@@ -28,7 +29,6 @@ from tflane_jax.metrics.map_matching import (
 from tflane_jax.metrics.map_overlap import OVERLAP_THRESHOLDS
 from tflane_jax.metrics.matching import average_precision_area, pooled, ranked
 from tflane_jax.metrics.merging import by_frame, joined
-from tflane_jax.metrics.resampling import Weights, frame_numbers, resampled_precisions
 
 _NAMES: dict[Measure, str] = {"chamfer": "MapTR Chamfer AP", "iou": "MapTR IoU AP"}
 _VERSIONS: dict[Sampling, str] = {"maptr": "v1", "maptrv2": "v2", "as_given": "v1, detections not resampled"}
@@ -131,7 +131,7 @@ class VectorMapMetrics:
         """Return no score: all but recall rank detections."""
         return {}
 
-    def resampled(self, weights: Weights, scope: Scope = "all") -> dict[str, Float[np.ndarray, " b"]]:
+    def bootstrap(self, weights: Weights, scope: Scope = "all") -> dict[str, Float[np.ndarray, " b"]]:
         """Return `mAP` and the `AP_...` of classes in samples that count the frames as often as `weights` says.
 
         Classes are those of `compute`. An AP that a sample lacks is 0, and does not count in its `mAP`.
@@ -141,7 +141,7 @@ class VectorMapMetrics:
         measured = np.flatnonzero(_counted(truths.sum(0), scope))
         for c in measured:
             own = classes == c
-            _, area = resampled_precisions(scores[own], hits[:, own], frame[own], truths[:, c], weights)
+            _, area = bootstrap_precisions(scores[own], hits[:, own], frame[own], truths[:, c], weights)
             precision[f"AP_{LINE_CLASSES[c]}"] = area.mean(1)
         if not precision:
             return {}

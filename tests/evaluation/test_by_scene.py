@@ -32,16 +32,16 @@ def test_sums_over_scenes_are_rounded():
 
 
 def test_scores_that_are_ratios_need_no_samples():
-    def resampled(weights):
+    def bootstrap(weights):
         assert weights.shape == (SAMPLES, 3)
         return {"all": {"DET_l": weights[:, 2] / 7, "TOP_ll": weights[:, 0]}}
 
     ratio = SceneRatio((1, 2), (3, 6))
-    found = shared_samples(resampled, np.array([0, 0, 1]), {"all/recall": ratio, "all/TOP_ll": ratio})
+    found = shared_samples(bootstrap, np.array([0, 0, 1]), {"all/recall": ratio, "all/TOP_ll": ratio})
     assert list(found) == ["all/DET_l"]
     assert found["all/DET_l"].lanes == (3, 6)
     assert set(found["all/DET_l"].values) == {0.0, 0.14286, 0.28571}
-    assert shared_samples(resampled, np.zeros(2, int), {"all/recall": ratio}) == {}  # one scene tells of no other
+    assert shared_samples(bootstrap, np.zeros(2, int), {"all/recall": ratio}) == {}  # one scene tells of no other
 
 
 def frames():

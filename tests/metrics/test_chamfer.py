@@ -68,7 +68,7 @@ def test_resampling_equals_that_of_each_line(seed, dims):
     together = PaddedLines.of(lines, "lines", dims).resampled(100)
     np.testing.assert_array_equal(together.counts, [100] * 5)
     for got, line in zip(together.points, lines, strict=True):
-        np.testing.assert_allclose(got, resample(line, 100), atol=1e-12)
+        np.testing.assert_allclose(got, resample(line, 100), rtol=0, atol=1e-12)
         np.testing.assert_array_equal(got[[0, -1]], line[[0, -1]])
 
 
@@ -76,7 +76,9 @@ def test_twins_are_resampled_alike_to_the_last_bit():
     rng = np.random.default_rng(0)
     line, other = random_lines(rng, 2, 2)
     points = PaddedLines.of([line, other, line], "lines", 2).resampled(100).points
+    alone = PaddedLines.of([line], "lines", 2).resampled(100).points
     np.testing.assert_array_equal(points[0], points[2])
+    np.testing.assert_array_equal(points[0], alone[0])
 
 
 def test_empty_and_invalid_input():

@@ -1,6 +1,7 @@
 """Lane-segment metrics against the official evaluators, and against numbers worked out by hand."""
 
 import dataclasses
+from functools import partial
 
 import numpy as np
 import pytest
@@ -11,10 +12,10 @@ from tests.metrics.cases import straight
 from tests.metrics.fixtures import expected_cases, load_segments
 from tests.metrics.segments import evaluate, frame, moved, random_segments, with_types
 from tflane_jax.errors import UserError
-from tflane_jax.metrics import LaneDetections
+from tflane_jax.metrics import GroupedMetrics, LaneDetections
 from tflane_jax.metrics.centerline_matching import LANE_THRESHOLDS
 from tflane_jax.metrics.groups import ByDistance, ByOcclusion
-from tflane_jax.metrics.lane_segment import GroupedSegmentMetrics, LaneSegmentMetrics
+from tflane_jax.metrics.lane_segment import LaneSegmentMetrics
 from tflane_jax.metrics.segment_matching import (
     AREA_THRESHOLDS,
     AreaTruth,
@@ -23,6 +24,7 @@ from tflane_jax.metrics.segment_matching import (
 )
 
 CASES = list(expected_cases("lanesegment"))
+OF_LANESEGNET = partial(LaneSegmentMetrics, "LaneSegNet")
 
 
 @pytest.mark.golden
@@ -130,7 +132,7 @@ PARTITIONS = {"occlusion": ByOcclusion(), "distance": ByDistance((5.0, 15.0))}
 def test_groups_share_the_segments_of_all(partition):
     rng = np.random.default_rng(5)
     frames = [random_segments(rng) for _ in range(6)]
-    grouped, parts = (GroupedSegmentMetrics(partition=partition) for _ in range(2)), []
+    grouped, parts = (GroupedMetrics(OF_LANESEGNET, partition=partition) for _ in range(2)), []
     grouped, other = grouped
     for detections, truth in frames:
         grouped.update(detections, truth)
@@ -147,7 +149,7 @@ def test_groups_share_the_segments_of_all(partition):
     assert (hits["all"] == sum(hits[name] for name in partition.names)).all()
     for detections, truth in frames[:2]:
         other.update(detections, truth)
-    rest = GroupedSegmentMetrics(partition=partition)
+    rest = GroupedMetrics(OF_LANESEGNET, partition=partition)
     for detections, truth in frames[2:]:
         rest.update(detections, truth)
     merged = other.merge(rest).compute()
@@ -158,7 +160,7 @@ def test_groups_share_the_segments_of_all(partition):
 def test_a_false_positive_belongs_to_the_group_of_its_nearest_segment_however_far(scores, precision):
     detections, truth = frame([-20.0, 20.0], [-20.0, 27.0, 60.0, -45.0], scores)
     assert match_segments(detections, truth, nearest="all").segments.nearest.tolist() == [0, 1, 1, 0]
-    metrics = GroupedSegmentMetrics(partition=ByDistance(), lane_groups=("right",))
+    metrics = GroupedMetrics(OF_LANESEGNET, partition=ByDistance(), lane_groups=("right",))
     metrics.update(detections, truth, members={"right": np.array([True, False])})
     result = metrics.compute()["right"]
     assert (result["lanes"], result["AP_ls"]) == (1, pytest.approx(precision))  # the last detection is its own
@@ -181,7 +183,7 @@ def test_errors_of_a_group_are_those_of_its_segments():
     detections, truth = with_types(
         frame([near[0], far[0]], [near[1], far[1]], [0.9, 0.8]), [(1, 1), (1, 1)], [(1, 1), (2, 1)]
     )
-    metrics = GroupedSegmentMetrics(partition=ByDistance((5.0,)), lane_groups=("second",))
+    metrics = GroupedMetrics(OF_LANESEGNET, partition=ByDistance((5.0,)), lane_groups=("second",))
     metrics.update(detections, truth, members={"second": np.array([False, True])})
     result = metrics.compute()
     assert (result["0 to 5 m"]["AE_dist"], result["0 to 5 m"]["AE_type"]) == (pytest.approx(0.6), 0.0)

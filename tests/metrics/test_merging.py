@@ -5,10 +5,10 @@ import functools
 import numpy as np
 import pytest
 
-from tests.metrics.test_resampling import centerlines, lines, segments
+from tests.metrics.test_bootstrap import centerlines, lines, segments
 from tflane_jax.metrics import CenterlineFScore, CenterlineMetrics, LaneSegmentMetrics, VectorMapMetrics
 from tflane_jax.metrics.matching import average_precision_11, average_precision_area, ranked
-from tflane_jax.metrics.merging import joined
+from tflane_jax.metrics.merging import by_frame, joined
 
 
 def test_joined():
@@ -17,6 +17,14 @@ def test_joined():
     parts = [np.array([0.1, 1e16]), np.array([0.2, 1.0]), np.array([0.3, -1e16])]
     assert joined(parts).tolist() == ((parts[0] + parts[1]) + parts[2]).tolist()  # in this order
     assert parts[0].tolist() == [0.1, 1e16]
+
+
+@pytest.mark.parametrize("shape", [(3,), (2, 3)])
+def test_arrays_of_frames(shape):
+    frames = [np.full(shape, number) for number in range(4)]
+    np.testing.assert_array_equal(by_frame(frames, shape, int), np.stack(frames))
+    none = by_frame([], shape, int)
+    assert (none.shape, none.dtype.kind) == ((0, *shape), "i")
 
 
 @pytest.mark.parametrize(

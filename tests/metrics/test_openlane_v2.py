@@ -1,6 +1,7 @@
 """OpenLane-V2 centerline metrics against the official evaluator, and against numbers worked out by hand."""
 
 import dataclasses
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -11,12 +12,16 @@ from hypothesis import strategies as st
 from tests.metrics.cases import hand_frame, random_frame, reordered
 from tests.metrics.fixtures import expected_cases, load_frames
 from tflane_jax.errors import UserError
-from tflane_jax.metrics import CenterlineMetrics, GroupedCenterlineMetrics, LaneDetections, LaneTruth
+from tflane_jax.metrics import CenterlineMetrics, GroupedMetrics, LaneDetections, LaneTruth
 from tflane_jax.metrics.centerline_matching import LANE_THRESHOLDS, iou_distance, match_frame, nearest_lanes
 from tflane_jax.metrics.groups import ByOcclusion
 
 VERSIONS = {"v2.1": "", "v1.0": "v1_0_"}
 CASES = list(expected_cases())
+
+
+def grouped_metrics(*groups, versions=("v2.1",), **options):
+    return GroupedMetrics(partial(CenterlineMetrics, versions), *groups, **options)
 
 
 def evaluate(frames, metrics: Any = None) -> Any:
@@ -141,7 +146,7 @@ def test_both_versions_take_one_matching(monkeypatch):
         return nearest_lanes(*arguments)
 
     monkeypatch.setattr("tflane_jax.metrics.centerline_matching.nearest_lanes", counted)
-    metrics = GroupedCenterlineMetrics(versions=("v2.1", "v1.0"))
+    metrics = grouped_metrics(versions=("v2.1", "v1.0"))
     result = evaluate([hand_frame()], metrics)
     assert len(calls) == 1
     assert result["all"]["TOP_ll"] == pytest.approx((0 + 2 + 2) / 18)
@@ -149,10 +154,10 @@ def test_both_versions_take_one_matching(monkeypatch):
     assert result["all"]["OLS_v1.0"] < result["all"]["OLS"]
     assert "TOP_ll_v1.0" in result["occluded"]
     assert metrics.protocol.startswith("OpenLane-V2 centerline v2.1, v1.0 where the name says so, occluded")
-    part = GroupedCenterlineMetrics(versions=("v2.1", "v1.0"))
+    part = grouped_metrics(versions=("v2.1", "v1.0"))
     assert metrics.merge(part).compute() == result
     with pytest.raises(UserError, match="cannot merge"):
-        metrics.merge(GroupedCenterlineMetrics())
+        metrics.merge(grouped_metrics())
 
 
 @pytest.mark.parametrize("versions", [(), ("v2.0",), ("v2.1", "v2.1"), "v2.1"])
@@ -162,7 +167,7 @@ def test_versions_that_do_not_exist_are_named(versions):
 
 
 def test_groups_by_hand():
-    metrics = GroupedCenterlineMetrics()
+    metrics = grouped_metrics()
     result = evaluate([hand_frame()], metrics)
     assert result["all"] == evaluate([hand_frame()])
     # B and C are occluded; the detections nearest to them are B (hit from 2 m on) and C reversed.
@@ -177,7 +182,7 @@ def test_groups_by_hand():
 
 def test_groups_of_lanes_that_the_caller_names():
     detections, truth = hand_frame()
-    metrics = GroupedCenterlineMetrics(lane_groups=("like clear", "none", "both"))
+    metrics = grouped_metrics(lane_groups=("like clear", "none", "both"))
     clear, none, both = np.array([1, 0, 0], bool), np.zeros(3, bool), np.array([1, 1, 0], bool)
     metrics.update(detections, truth, members={"like clear": clear, "none": none, "both": both})
     result = metrics.compute()
@@ -197,7 +202,7 @@ def test_groups_of_lanes_that_the_caller_names():
 
 
 def test_frames_outside_a_group_of_frames_count_nothing_in_it():
-    metrics = GroupedCenterlineMetrics(frame_groups=("gap",))
+    metrics = grouped_metrics(frame_groups=("gap",))
     metrics.update(*hand_frame())
     metrics.update(*hand_frame(), "gap")
     assert metrics.recalled()["gap"].tolist() == [[0, 0], [3, 5]]
@@ -205,7 +210,7 @@ def test_frames_outside_a_group_of_frames_count_nothing_in_it():
 
 
 def test_a_frame_may_belong_to_several_groups_of_frames():
-    metrics = GroupedCenterlineMetrics(frame_groups=("gap", "far", "near"))
+    metrics = grouped_metrics(frame_groups=("gap", "far", "near"))
     metrics.update(*hand_frame(), ("gap", "far"))
     metrics.update(*hand_frame(), ["near"])
     found = metrics.compute()
@@ -215,7 +220,7 @@ def test_a_frame_may_belong_to_several_groups_of_frames():
 
 def test_threshold_of_occlusion_is_strict_and_configurable():
     lanes = {
-        limit: evaluate([hand_frame()], GroupedCenterlineMetrics(partition=ByOcclusion(limit)))["occluded"]["lanes"]
+        limit: evaluate([hand_frame()], grouped_metrics(partition=ByOcclusion(limit)))["occluded"]["lanes"]
         for limit in (0.2, 0.3, 0.4, 0.41)
     }
     assert lanes == {0.2: 0, 0.3: 1, 0.4: 1, 0.41: 2}
@@ -225,7 +230,7 @@ def test_threshold_of_occlusion_is_strict_and_configurable():
 @given(seed=st.integers(0, 10**6), version=st.sampled_from(list(VERSIONS)))
 def test_merge_equals_one_pass_and_order_of_detections_is_free(seed, version):
     frames = [random_frame(seed + i, lanes=5 * (i != 1), detections=9 * (i != 2)) for i in range(4)]
-    whole, first, second = (GroupedCenterlineMetrics(versions=(version,)) for _ in range(3))
+    whole, first, second = (grouped_metrics(versions=(version,)) for _ in range(3))
     expected = evaluate(frames, whole)
     evaluate(frames[:2], first)
     evaluate(frames[2:], second)
@@ -270,7 +275,7 @@ def test_empty_input():
         assert metrics["lanes"] == 0
     detections, truth = hand_frame()
     assert evaluate([(none, truth)])["DET_l"] == 0.0
-    grouped = evaluate([(detections, empty)], GroupedCenterlineMetrics())
+    grouped = evaluate([(detections, empty)], grouped_metrics())
     assert grouped["all"]["DET_l"] == 0.0
     assert grouped["clear"]["DET_l"] == 1.0  # false positives of a frame without lanes count only in "all"
     assert "TOP_ll" not in evaluate([(detections, empty)], CenterlineMetrics(("v1.0",)))
@@ -318,7 +323,7 @@ def broken_elements(side, **changes):
 )
 def test_arrays_that_do_not_fit(frame, message):
     with pytest.raises(UserError, match=message):
-        evaluate([frame], GroupedCenterlineMetrics())
+        evaluate([frame], grouped_metrics())
 
 
 def test_misuse_is_named():
@@ -326,11 +331,11 @@ def test_misuse_is_named():
     with pytest.raises(UserError, match="one version"):
         CenterlineMetrics(("v1.0",)).merge(CenterlineMetrics(("v2.1",)))
     with pytest.raises(UserError, match="cannot merge"):
-        GroupedCenterlineMetrics(("all",)).merge(GroupedCenterlineMetrics())
+        grouped_metrics(("all",)).merge(grouped_metrics())
     unknown = dataclasses.replace(truth, visibility=None)
     with pytest.raises(UserError, match="visibility"):
-        evaluate([(detections, unknown)], GroupedCenterlineMetrics())
-    assert evaluate([(detections, unknown)], GroupedCenterlineMetrics(("all",)))["all"]["lanes"] == 3
+        evaluate([(detections, unknown)], grouped_metrics())
+    assert evaluate([(detections, unknown)], grouped_metrics(("all",)))["all"]["lanes"] == 3
     lanes_only = dataclasses.replace(detections, elements=None)
     with pytest.raises(UserError, match="missing in 1 of 2 frames"):
         evaluate([(detections, truth), (lanes_only, truth)])

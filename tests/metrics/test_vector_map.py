@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from tests.metrics.fixtures import expected_cases, load_maps
 from tflane_jax.errors import UserError
-from tflane_jax.metrics import GroupedMapMetrics, MapDetections, MapTruth, VectorMapMetrics
+from tflane_jax.metrics import GroupedMetrics, MapDetections, MapTruth, VectorMapMetrics
 from tflane_jax.metrics.map_matching import CLASSES, MAP_THRESHOLDS, Sampling, match_map
 
 # What the official program calls the three ways of sampling detections.
@@ -126,13 +126,15 @@ def test_by_hand():
 
 def test_a_class_that_a_part_lacks_does_not_count_there():
     """All lines are found and none is a crossing, which counts 0 in the whole, as officially, and in no part of it."""
-    metrics = GroupedMapMetrics(frame_groups=("both", "boundary", "nowhere"), lane_groups=("dividers", "none"))
+    metrics = GroupedMetrics(
+        VectorMapMetrics, frame_groups=("both", "boundary", "nowhere"), lane_groups=("dividers", "none")
+    )
     for group, numbers in (("both", [0, 2]), ("boundary", [2])):
         lines, classes = [line(9.0 * number) for number in numbers], np.array(numbers)
         truth = MapTruth(lines, classes, visibility=np.where(classes == 0, 0.1, 0.9))
         members = {"dividers": classes == 0, "none": classes == 1}
         metrics.update(MapDetections(lines, classes, np.full(len(lines), 0.9)), truth, group, members)
-    result, samples = metrics.compute(), metrics.resampled(np.array([[1, 1], [0, 1], [0, 0]]))
+    result, samples = metrics.compute(), metrics.bootstrap(np.array([[1, 1], [0, 1], [0, 0]]))
     whole = {name: value for name, value in result["all"].items() if "@" not in name}
     assert whole == {
         "frames": 2,

@@ -9,9 +9,8 @@ import pytest
 from tests.metrics.cases import hand_frame, random_frame
 from tflane_jax.cli import main
 from tflane_jax.errors import UserError
-from tflane_jax.metrics import CenterlineMetrics
+from tflane_jax.metrics import CenterlineMetrics, GroupedMetrics
 from tflane_jax.metrics.groups import ByDistance
-from tflane_jax.metrics.openlane_v2 import GroupedCenterlineMetrics
 from tflane_jax.scoring.plain import read_predictions
 
 PROTOCOL = "openlane-v2.1-centerline"
@@ -161,7 +160,7 @@ def test_every_lane_is_in_one_distance_group(tmp_path, capsys):
 
 def test_distance_groups_are_a_partition_and_merge():
     frames = [random_frame(seed) for seed in range(4)]
-    whole, first, second = (GroupedCenterlineMetrics(partition=ByDistance((5.0, 15.0))) for _ in range(3))
+    whole, first, second = (GroupedMetrics(CenterlineMetrics, partition=ByDistance((5.0, 15.0))) for _ in range(3))
     for i, frame in enumerate(frames):
         whole.update(*frame)
         (first if i < 2 else second).update(*frame)

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from tflane_jax.evaluation.results import SceneRatio, SceneSamples
-from tflane_jax.metrics.resampling import Weights
+from tflane_jax.metrics.bootstrap import Weights
 
 SAMPLES = 400
 DIGITS = 5
@@ -47,21 +47,21 @@ def summed_ratio(parts: Float[np.ndarray, "f 2"], scene: Int[np.ndarray, " f"]) 
 
 
 def shared_samples(
-    resampled: Callable[[Weights], Mapping[str, Mapping[str, Float[np.ndarray, " b"]]]],
+    bootstrap: Callable[[Weights], Mapping[str, Mapping[str, Float[np.ndarray, " b"]]]],
     scene: Int[np.ndarray, " f"],
     ratios: Mapping[str, SceneRatio],
 ) -> dict[str, SceneSamples]:
     """Return the scores that are no ratios in the shared samples, by "group/name"; none of fewer than two scenes.
 
     Args:
-        resampled: returns the scores of each group in samples of the frames.
+        bootstrap: returns the scores of each group in samples of the frames.
         scene: number of each frame's scene.
         ratios: scores that are ratios; the recall of each group gives the number of lanes in each scene.
     """
     scenes = int(scene.max(initial=-1)) + 1
     if scenes < 2:
         return {}
-    groups = resampled(scene_weights(scenes, SAMPLES)[:, scene])
+    groups = bootstrap(scene_weights(scenes, SAMPLES)[:, scene])
     return {
         f"{group}/{name}": SceneSamples(ratios[f"{group}/recall"].denominator, tuple(values.round(DIGITS).tolist()))
         for group, of_group in groups.items()

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any, TypeVar
 
 import jax
@@ -32,12 +33,12 @@ from tflane_jax.evaluation.predict import FOR_SCORES, Predictor, predicted_batch
 from tflane_jax.evaluation.results import EvaluationConfig, SceneRatio, SceneSamples
 from tflane_jax.evaluation.vector_maps import measured_lines
 from tflane_jax.geometry import PerceptionRange
+from tflane_jax.metrics.bootstrap import Weights
 from tflane_jax.metrics.centerline_matching import LANE_THRESHOLDS
-from tflane_jax.metrics.groups import FrameGroup
-from tflane_jax.metrics.lane_segment import GroupedSegmentMetrics, LaneSegmentMetrics
+from tflane_jax.metrics.groups import FrameGroup, GroupedMetrics
+from tflane_jax.metrics.lane_segment import LaneSegmentMetrics
 from tflane_jax.metrics.map_matching import MAP_THRESHOLDS, Dims, Measure
-from tflane_jax.metrics.openlane_v2 import GroupedCenterlineMetrics
-from tflane_jax.metrics.resampling import Weights
+from tflane_jax.metrics.openlane_v2 import CenterlineMetrics
 from tflane_jax.metrics.segment_matching import match_segments
 from tflane_jax.metrics.topology import Version
 from tflane_jax.models.parameters import Params
@@ -74,11 +75,10 @@ class LaneGraphMetrics:
         line_labels: Sequence[LineLabel] = (),
         line_dims: Dims = 2,
     ) -> None:
-        self._centerlines = GroupedCenterlineMetrics(
-            versions=versions, frame_groups=frame_groups, lane_groups=lane_groups
-        )
+        grouped = partial(GroupedMetrics, frame_groups=frame_groups, lane_groups=lane_groups)
+        self._centerlines = grouped(partial(CenterlineMetrics, versions))
         self._continues: list[bool] = []  # whether a frame belongs to the scene of the frame before
-        self._segments = GroupedSegmentMetrics(frame_groups=frame_groups, lane_groups=lane_groups)
+        self._segments = grouped(partial(LaneSegmentMetrics, "LaneSegNet"))
         self._devkit = LaneSegmentMetrics("OpenLane-V2")
         self._lines = MapLineMetrics(
             map_measures, line_labels, lane_groups if line_labels else (), line_dims, frame_groups
@@ -126,7 +126,7 @@ class LaneGraphMetrics:
             own = true is None or len(true.lane) == len(example.segments.valid)
             segments = truth_of_segments(example.segments, example.areas, true, None if own else example.lanes)
             frame = match_segments(detections_of_segments(prediction.segments, found), segments, nearest="all")
-            self._segments.add(frame, segments.lanes, frame_group, members.get("segments"))
+            self._segments.add(frame, segments, frame_group, members.get("segments"))
             self._devkit.add(frame)
         if prediction.lines is not None:
             self._lines.update(prediction.lines, example, members.get("lines"), frame_group)
@@ -164,16 +164,16 @@ class LaneGraphMetrics:
 
     def samples(self) -> dict[str, SceneSamples]:
         """Return the scores that rank detections, of every group, in bootstrap samples of the scenes."""
-        return shared_samples(self._resampled, scene_numbers(self._continues), self.ratios())
+        return shared_samples(self._bootstrap, scene_numbers(self._continues), self.ratios())
 
-    def _resampled(self, weights: Weights) -> dict[str, dict[str, Float[np.ndarray, " b"]]]:
-        groups = self._centerlines.resampled(weights) if "centerlines" in self._measured else {}
+    def _bootstrap(self, weights: Weights) -> dict[str, dict[str, Float[np.ndarray, " b"]]]:
+        groups = self._centerlines.bootstrap(weights) if "centerlines" in self._measured else {}
         if "segments" in self._measured:
-            segments = self._segments.resampled(weights)
+            segments = self._segments.bootstrap(weights)
             if "TOP_lt" in self._devkit.means():  # elements were measured: its own scores
-                segments["all"] |= _of_devkit(self._devkit.resampled(weights))
+                segments["all"] |= _of_devkit(self._devkit.bootstrap(weights))
             groups |= {self._prefix + group: values for group, values in segments.items()}
-        return groups | (self._lines.resampled(weights) if "lines" in self._measured else {})
+        return groups | (self._lines.bootstrap(weights) if "lines" in self._measured else {})
 
     @property
     def _prefix(self) -> str:

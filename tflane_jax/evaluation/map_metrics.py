@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -11,11 +12,11 @@ from jaxtyping import Bool, Float, Int
 
 from tflane_jax.evaluation.line_tracks import LineTracks
 from tflane_jax.evaluation.vector_maps import detections_of_lines, truth_of_lines, truth_of_segment_lines
+from tflane_jax.metrics.bootstrap import Weights
 from tflane_jax.metrics.consistency import CONFIDENT, MapConsistency
-from tflane_jax.metrics.groups import BY_OCCLUSION, FrameGroup
+from tflane_jax.metrics.groups import BY_OCCLUSION, FrameGroup, GroupedMetrics
 from tflane_jax.metrics.map_matching import Dims, MatchedMap, Measure, match_map
-from tflane_jax.metrics.resampling import Weights
-from tflane_jax.metrics.vector_map import GroupedMapMetrics, VectorMapMetrics
+from tflane_jax.metrics.vector_map import VectorMapMetrics
 from tflane_jax.scene import Example, LinePrediction
 
 LineLabel = Literal["visibility", "identity"]
@@ -51,7 +52,8 @@ class MapLineMetrics:
     ) -> None:
         self._dims: Dims = dims
         partition = BY_OCCLUSION.names if "visibility" in labels else ()
-        self._chamfer = GroupedMapMetrics(("all", *partition), frame_groups=frame_groups, lane_groups=groups, dims=dims)
+        make = partial(VectorMapMetrics, dims=dims)
+        self._chamfer = GroupedMetrics(make, ("all", *partition), frame_groups=frame_groups, lane_groups=groups)
         self._overlap = VectorMapMetrics(measure="iou", dims=dims) if "iou" in measures else None
         self._consistency = MapConsistency() if "identity" in labels else None
         self._tracks = LineTracks()
@@ -115,11 +117,11 @@ class MapLineMetrics:
             groups["lines IoU"] = self._overlap.compute()
         return groups
 
-    def resampled(self, weights: Weights) -> dict[str, dict[str, Float[np.ndarray, " b"]]]:
-        """Return by group the Chamfer AP, and `C-mAP`, in samples of the frames, see `metrics.resampling`."""
-        groups = {_name(group): values for group, values in self._chamfer.resampled(weights).items()}
+    def bootstrap(self, weights: Weights) -> dict[str, dict[str, Float[np.ndarray, " b"]]]:
+        """Return by group the Chamfer AP, and `C-mAP`, in samples of the frames, see `metrics.bootstrap`."""
+        groups = {_name(group): values for group, values in self._chamfer.bootstrap(weights).items()}
         if self._consistency is not None:
-            groups["lines"] |= self._consistency.resampled(weights)
+            groups["lines"] |= self._consistency.bootstrap(weights)
         return groups
 
     def recalled(self) -> dict[str, Int[np.ndarray, "f 2"]]:

@@ -9,9 +9,10 @@ from tflane_jax.metrics.frames import (
     LaneDetections,
     LaneTruth,
 )
-from tflane_jax.metrics.lane_segment import GroupedSegmentMetrics, LaneSegmentMetrics
+from tflane_jax.metrics.groups import GroupedMetrics
+from tflane_jax.metrics.lane_segment import LaneSegmentMetrics
 from tflane_jax.metrics.map_matching import MapDetections, MapTruth
-from tflane_jax.metrics.openlane_v2 import CenterlineMetrics, GroupedCenterlineMetrics
+from tflane_jax.metrics.openlane_v2 import CenterlineMetrics
 from tflane_jax.metrics.segment_matching import (
     AreaDetections,
     AreaTruth,
@@ -19,7 +20,7 @@ from tflane_jax.metrics.segment_matching import (
     SegmentTruth,
 )
 from tflane_jax.metrics.tusimple import TuSimpleMetrics
-from tflane_jax.metrics.vector_map import GroupedMapMetrics, VectorMapMetrics
+from tflane_jax.metrics.vector_map import VectorMapMetrics
 
 __all__ = [
     "AreaDetections",
@@ -28,9 +29,7 @@ __all__ = [
     "CenterlineMetrics",
     "ElementDetections",
     "ElementTruth",
-    "GroupedCenterlineMetrics",
-    "GroupedMapMetrics",
-    "GroupedSegmentMetrics",
+    "GroupedMetrics",
     "LaneDetections",
     "LaneSegmentMetrics",
     "LaneTruth",

@@ -55,8 +55,9 @@ class PaddedLines:
     def resampled(self, count: int) -> PaddedLines:
         """Return `count` points on each line, equally spaced in ground-plane arc length, both ends included.
 
-        Bit-identical to `geometry.polylines.resample`. The rounding of `resample_lines` depends on the other lines, so
-        that two equal lines could have different distances.
+        The points of `geometry.polylines.resample` but for rounding (below 1e-12 m). A line's points do not depend on
+        the other lines, not even in the last bit. Those of `resample_lines` do, so that two equal lines could have
+        different distances.
         """
         if len(self) == 0:
             return PaddedLines(np.zeros((0, count, self.points.shape[-1])), self.counts)

@@ -20,9 +20,10 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float, Int
 
+from tflane_jax.metrics.bootstrap import Weights, bootstrap_precisions, frame_numbers
 from tflane_jax.metrics.map_matching import CLASSES, MAP_THRESHOLDS, MatchedMap
 from tflane_jax.metrics.matching import average_precision_area, pooled
-from tflane_jax.metrics.resampling import Weights, frame_numbers, resampled_precisions
+from tflane_jax.metrics.merging import by_frame
 
 CONFIDENT = 0.4
 
@@ -31,7 +32,6 @@ class MapConsistency:
     """Accumulator of C-mAP; the frames of a scene come in succession."""
 
     def __init__(self) -> None:
-        self._truths = np.zeros(len(CLASSES), np.int64)
         self._detections: list[tuple[np.ndarray, ...]] = []  # of every frame: scores, classes, consistent hits
         self._frame_truths: list[np.ndarray] = []  # of every frame: true lines by class
         # Of every threshold, by number of a true line: identities in the first frame that matches it.
@@ -65,17 +65,17 @@ class MapConsistency:
                     new.setdefault(line, set()).add(identity)
                 row[p] = line not in first or identity in first[line]
             first |= new
-        self._truths += frame.truths[: len(CLASSES)]
         self._frame_truths.append(frame.truths[: len(CLASSES)])
         self._detections.append((frame.scores, frame.classes, consistent))
 
     def compute(self) -> dict[str, float]:
         """Return `C-mAP`, the mean over classes of `C-AP_divider` ..., each the mean over MapTR's thresholds."""
         scores, classes, hits = pooled(self._detections, (0,), (len(MAP_THRESHOLDS), 0))
+        truths = by_frame(self._frame_truths, (len(CLASSES),), int).sum(0)
         precision = {
             f"C-AP_{name}": np.mean(
                 [
-                    average_precision_area(scores[classes == c], row[classes == c], int(self._truths[c]))
+                    average_precision_area(scores[classes == c], row[classes == c], int(truths[c]))
                     for row in hits.astype(bool)
                 ]
             )
@@ -84,13 +84,13 @@ class MapConsistency:
         means = {"C-mAP": np.mean(list(precision.values()))} | precision
         return {name: float(value) for name, value in means.items()}
 
-    def resampled(self, weights: Weights) -> dict[str, Float[np.ndarray, " b"]]:
+    def bootstrap(self, weights: Weights) -> dict[str, Float[np.ndarray, " b"]]:
         """Return the numbers of `compute` in samples that count the frames of a scene equally often, see `weights`."""
         scores, classes, hits = pooled(self._detections, (0,), (len(MAP_THRESHOLDS), 0))
-        frame, truths = frame_numbers(self._detections), np.array(self._frame_truths, int).reshape(-1, len(CLASSES))
+        frame, truths = frame_numbers(self._detections), by_frame(self._frame_truths, (len(CLASSES),), int)
         precision = {}
         for c, name in enumerate(CLASSES):
             own = classes == c
-            _, area = resampled_precisions(scores[own], hits[:, own], frame[own], truths[:, c], weights)
+            _, area = bootstrap_precisions(scores[own], hits[:, own], frame[own], truths[:, c], weights)
             precision[f"C-AP_{name}"] = area.mean(1)
         return {"C-mAP": np.mean(list(precision.values()), axis=0)} | precision

@@ -18,15 +18,15 @@ import copy
 import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Generic, Literal, Protocol, Self, TypeVar
+from typing import Any, Literal, Protocol, Self
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from tflane_jax.errors import UserError
+from tflane_jax.metrics.bootstrap import Weights
 from tflane_jax.metrics.frames import Lines, check_shape
 from tflane_jax.metrics.merging import joined
-from tflane_jax.metrics.resampling import Weights
 
 COUNTS = ("frames", "lanes", "lines")
 """Numbers of a group that are no scores, but what its scores rest on."""
@@ -78,11 +78,15 @@ class Matched(Protocol):
 
 
 class LaneMetrics(Protocol):
-    """An accumulator of matched frames."""
+    """An accumulator of matched frames: `CenterlineMetrics`, `LaneSegmentMetrics` or `VectorMapMetrics`."""
 
     @property
     def protocol(self) -> str:
         """Name and version."""
+        ...
+
+    def match(self, detections: Any, truth: Any) -> Matched:
+        """Match a frame, with the nearest true lane of every detection, however far."""
         ...
 
     def add(self, frame: Any) -> None:
@@ -101,7 +105,7 @@ class LaneMetrics(Protocol):
         """Return the scores, recall aside, that are ratios of two sums over frames: the terms of both sums."""
         ...
 
-    def resampled(self, weights: Weights, scope: Scope = "all") -> dict[str, Float[np.ndarray, " b"]]:
+    def bootstrap(self, weights: Weights, scope: Scope = "all") -> dict[str, Float[np.ndarray, " b"]]:
         """Return the scores that rank detections, in samples that count the frames as often as `weights` says."""
         ...
 
@@ -178,18 +182,17 @@ class ByDistance:
         return (low <= distance) & (distance < high)
 
 
-FrameT = TypeVar("FrameT", bound=Matched)
 FrameGroup = str | Sequence[str] | None
 """The groups of frames that a frame belongs to: one, several, or none."""
 
 
-class GroupedMetrics(Generic[FrameT]):
-    """Accumulators of all lanes and of groups of them, see the module's docstring.
+class GroupedMetrics:
+    """Accumulators of all lanes and of groups of them, see the module's docstring; of map lines in their place.
 
     Args:
         make: returns an accumulator.
-        partition: of the lanes; its groups are reported.
         groups: which of "all" and the groups of the partition to report; default all of them.
+        partition: of the lanes; its groups are reported. Default by occlusion.
         frame_groups: names of groups of frames, which are measured like `all` on these frames alone.
         lane_groups: names of further groups of lanes, which may overlap; the caller gives their members.
     """
@@ -197,9 +200,9 @@ class GroupedMetrics(Generic[FrameT]):
     def __init__(
         self,
         make: Callable[[], LaneMetrics],
-        partition: Partition,
         groups: Sequence[str] | None = None,
         *,
+        partition: Partition = BY_OCCLUSION,
         frame_groups: Sequence[str] = (),
         lane_groups: Sequence[str] = (),
     ) -> None:
@@ -208,7 +211,7 @@ class GroupedMetrics(Generic[FrameT]):
         self._lane_groups = frozenset(lane_groups)
         groups = ("all", *partition.names) if groups is None else groups
         self._metrics = {group: make() for group in (*groups, *lane_groups, *frame_groups)}
-        self._protocol = make().protocol
+        self._empty = make()
         # Of every frame: true lanes and hits, summed over the thresholds.
         self._recalled: dict[str, list[tuple[int, int]]] = {group: [] for group in self._metrics}
         # Of every frame: whether the group measures it.
@@ -217,11 +220,24 @@ class GroupedMetrics(Generic[FrameT]):
     @property
     def protocol(self) -> str:
         """Name and version, the title of every table of these numbers."""
-        return self._protocol + self.partition.suffix
+        return self._empty.protocol + self.partition.suffix
+
+    def update(
+        self,
+        detections: Any,
+        truth: TrueLanes,
+        frame_group: FrameGroup = None,
+        members: Mapping[str, Bool[np.ndarray, " g"]] | None = None,
+    ) -> None:
+        """Add one frame, given as to the accumulator's own `update`; further arguments as of `add`.
+
+        Raises UserError for arrays that do not fit together, or a visibility that is not known.
+        """
+        self.add(self._empty.match(detections, truth), truth, frame_group, members)
 
     def add(
         self,
-        frame: FrameT,
+        frame: Matched,
         truth: TrueLanes,
         frame_group: FrameGroup = None,
         members: Mapping[str, Bool[np.ndarray, " g"]] | None = None,
@@ -280,13 +296,13 @@ class GroupedMetrics(Generic[FrameT]):
             for group, metrics in self._metrics.items()
         }
 
-    def resampled(self, weights: Weights) -> dict[str, dict[str, Float[np.ndarray, " b"]]]:
+    def bootstrap(self, weights: Weights) -> dict[str, dict[str, Float[np.ndarray, " b"]]]:
         """Return by group the scores that rank detections, in samples that count the frames as often as `weights` says.
 
-        The samples are exact, see `metrics.resampling`.
+        The samples are exact, see `metrics.bootstrap`.
         """
         return {
-            group: metrics.resampled(weights[:, np.array(self._measures[group], bool)], self._scope(group))
+            group: metrics.bootstrap(weights[:, np.array(self._measures[group], bool)], self._scope(group))
             for group, metrics in self._metrics.items()
         }
 

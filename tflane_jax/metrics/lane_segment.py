@@ -10,19 +10,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import partial
-from typing import Literal, Self, TypeVar
+from typing import Any, Literal, Self, TypeVar
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float, Int
 
 from tflane_jax.errors import UserError
+from tflane_jax.metrics.bootstrap import Weights, bootstrap_precisions, frame_numbers
 from tflane_jax.metrics.centerline_matching import LANE_THRESHOLDS
-from tflane_jax.metrics.groups import BY_OCCLUSION, FrameGroup, GroupedMetrics, Partition, Scope
+from tflane_jax.metrics.groups import Scope
 from tflane_jax.metrics.matching import average_precision_11, pooled
-from tflane_jax.metrics.merging import joined
-from tflane_jax.metrics.openlane_v2 import CenterlineMetrics
-from tflane_jax.metrics.resampling import Weights, frame_numbers, resampled_precisions
+from tflane_jax.metrics.merging import by_frame, joined
+from tflane_jax.metrics.openlane_v2 import CenterlineMetrics, overall_score
 from tflane_jax.metrics.segment_matching import (
     AREA_THRESHOLDS,
     BOUNDARY,
@@ -35,6 +34,7 @@ from tflane_jax.metrics.segment_matching import (
 
 Flavour = Literal["OpenLane-V2", "LaneSegNet"]
 T = TypeVar("T")
+_CATEGORIES = {"crossing": CROSSING, "boundary": BOUNDARY}
 
 
 class LaneSegmentMetrics:
@@ -48,7 +48,6 @@ class LaneSegmentMetrics:
     def __init__(self, flavour: Flavour = "OpenLane-V2") -> None:
         self.flavour: Flavour = flavour
         self._lanes = CenterlineMetrics(("v2.1",))
-        self._true_areas = np.zeros(BOUNDARY + 1, np.int64)  # by category
         self._area_detections: list[tuple[np.ndarray, ...]] = []  # of every frame: scores, categories, hits
         self._frame_areas: list[np.ndarray] = []  # of every frame: true areas by category
         # By threshold, over matched pairs: pairs, sum of distances; pairs with types, sum of wrong fractions.
@@ -65,12 +64,15 @@ class LaneSegmentMetrics:
         """Add one frame; raise UserError for arrays that do not fit together."""
         self.add(match_segments(detections, truth))
 
+    def match(self, detections: SegmentDetections, truth: SegmentTruth) -> MatchedSegments:
+        """Match one frame for groups, with the nearest segment of every detection, however far; raises as `update`."""
+        return match_segments(detections, truth, nearest="all")
+
     def add(self, frame: MatchedSegments) -> None:
         """Add one frame that has been matched."""
         segments, areas = frame.segments, frame.areas
         self._lanes.add(replace(segments, elements=None) if self.flavour == "LaneSegNet" else segments)
         self._area_detections.append((areas.scores, areas.categories, areas.hits))
-        self._true_areas += areas.truths
         self._frame_areas.append(areas.truths)
         self._errors[:2] += segments.hits.sum(1), segments.hits @ frame.distance
         if frame.wrong is not None:
@@ -103,56 +105,68 @@ class LaneSegmentMetrics:
         """
         lanes = self._lanes.compute()
         scores, categories, hits = pooled(self._area_detections, (0,), (len(AREA_THRESHOLDS), 0))
-        precision = {
-            name: [average_precision_11(scores[members], row[members], int(self._true_areas[category])) for row in hits]
-            for name, category in (("crossing", CROSSING), ("boundary", BOUNDARY))
-            for members in [categories == category]
-        }
+        truths = self._true_areas.sum(0)
         areas = {
+            name: [average_precision_11(scores[own], row[own], int(truths[category])) for row in hits]
+            for name, category in _CATEGORIES.items()
+            for own in [categories == category]
+        }
+        derived = {name: float(value) for name, value in self._derived(lanes, areas).items()}
+        at_threshold = {
             f"{name}@{threshold}": value
-            for name, values in precision.items()
+            for name, values in areas.items()
             for threshold, value in zip(AREA_THRESHOLDS, values, strict=True)
         }
         if self.flavour == "LaneSegNet":
             count = {name: lanes[name] for name in ("frames", "lanes")}
             segments = {f"AP_ls@{t}": lanes[f"DET_l@{t}"] for t in LANE_THRESHOLDS}
-            ap_ls, ap_ped = lanes["DET_l"], float(np.mean(precision["crossing"]))
-            means = {"AP_ls": ap_ls, "AP_ped": ap_ped, "AP_boundary": float(np.mean(precision["boundary"]))}
-            totals = {"mAP": (ap_ls + ap_ped) / 2, "TOP_lsls": lanes["TOP_ll"]}
             found = {name: value for name, value in lanes.items() if name == "AP_l" or name.startswith("recall")}
-            return _in_scope(count | means | totals | segments | found | areas | self._matched_errors(), scope)
+            lanes, derived = count, derived | segments | found
         lanes.pop("OLS", None)
-        lanes["DET_a"] = float(np.mean(list(areas.values())))
-        if "DET_t" in lanes:
-            detection = [lanes["DET_l"], lanes["DET_a"], lanes["DET_t"]]
-            lanes["OLUS"] = float(np.mean([*detection, lanes["TOP_ll"] ** 0.5, lanes["TOP_lt"] ** 0.5]))
-        return _in_scope(lanes | areas | self._matched_errors(), scope)
+        return _in_scope(lanes | derived | at_threshold | self._matched_errors(), scope)
 
     def means(self) -> dict[str, Float[np.ndarray, "f 2"]]:
         """Return the scores that are means over vertices, see `CenterlineMetrics.means`."""
         lanes = self._lanes.means()
         return {"TOP_lsls": lanes["TOP_ll"]} if self.flavour == "LaneSegNet" else lanes
 
-    def resampled(self, weights: Weights, scope: Scope = "all") -> dict[str, Float[np.ndarray, " b"]]:
+    def bootstrap(self, weights: Weights, scope: Scope = "all") -> dict[str, Float[np.ndarray, " b"]]:
         """Return AP, mAP, DET, TOP and OLUS of samples that count the frames as often as `weights` says."""
-        lanes = self._lanes.resampled(weights)
+        lanes = self._lanes.bootstrap(weights)
         scores, categories, hits = pooled(self._area_detections, (0,), (len(AREA_THRESHOLDS), 0))
-        frame, truths = frame_numbers(self._area_detections), np.array(self._frame_areas, int).reshape(-1, BOUNDARY + 1)
-        crossing, boundary = (
-            resampled_precisions(scores[own], hits[:, own], frame[own], truths[:, category], weights)[0].mean(1)
-            for category in (CROSSING, BOUNDARY)
+        frame, truths = frame_numbers(self._area_detections), self._true_areas
+        areas = {
+            name: list(bootstrap_precisions(scores[own], hits[:, own], frame[own], truths[:, category], weights)[0].T)
+            for name, category in _CATEGORIES.items()
             for own in [categories == category]
-        )
+        }
+        derived = self._derived(lanes, areas)
         if self.flavour == "LaneSegNet":
-            areas = {"AP_ped": crossing, "AP_boundary": boundary, "mAP": (lanes["DET_l"] + crossing) / 2}
-            segments = {"AP_ls": lanes["DET_l"], "AP_l": lanes["AP_l"], "TOP_lsls": lanes["TOP_ll"]}
-            return _in_scope(segments | areas, scope)
+            lanes = {"AP_l": lanes["AP_l"]}
         lanes.pop("OLS", None)
-        lanes["DET_a"] = (crossing + boundary) / 2
-        if "DET_t" in lanes:
-            roots = lanes["TOP_ll"] ** 0.5, lanes["TOP_lt"] ** 0.5
-            lanes["OLUS"] = np.mean([lanes["DET_l"], lanes["DET_a"], lanes["DET_t"], *roots], axis=0)
-        return _in_scope(lanes, scope)
+        return _in_scope(lanes | derived, scope)
+
+    @property
+    def _true_areas(self) -> Int[np.ndarray, "f 3"]:
+        """True areas of every frame by category."""
+        return by_frame(self._frame_areas, (BOUNDARY + 1,), int)
+
+    def _derived(self, lanes: Mapping[str, Any], areas: Mapping[str, Sequence[Any]]) -> dict[str, Any]:
+        """Return the scores that the flavour makes of numbers, or of arrays of samples.
+
+        Args:
+            lanes: scores of segments, named as those of centerlines.
+            areas: of each category, the average precision at every threshold.
+        """
+        if self.flavour == "LaneSegNet":
+            ap_ls, ap_ped = lanes["DET_l"], np.mean(areas["crossing"], axis=0)
+            means = {"AP_ls": ap_ls, "AP_ped": ap_ped, "AP_boundary": np.mean(areas["boundary"], axis=0)}
+            return means | {"mAP": (ap_ls + ap_ped) / 2, "TOP_lsls": lanes["TOP_ll"]}
+        det_a = np.mean([*areas["crossing"], *areas["boundary"]], axis=0)
+        if "DET_t" not in lanes:
+            return {"DET_a": det_a}
+        topology = [lanes["TOP_ll"], lanes["TOP_lt"]]
+        return {"DET_a": det_a, "OLUS": overall_score([lanes["DET_l"], det_a, lanes["DET_t"]], topology)}
 
     def _matched_errors(self) -> dict[str, float]:
         errors = {}
@@ -161,43 +175,6 @@ class LaneSegmentMetrics:
             if pairs[-1]:
                 errors |= {name: means[f"{name}@{LANE_THRESHOLDS[-1]}"]} | means
         return errors
-
-
-class GroupedSegmentMetrics(GroupedMetrics[MatchedSegments]):
-    """The lane-segment metrics of all segments and of the groups of a partition, see `metrics.groups`.
-
-    Only `all` and groups of frames have areas; the other groups have only the numbers of segments.
-
-    Args:
-        groups, frame_groups, lane_groups: see `GroupedMetrics`.
-        partition: of the segments; default by occlusion.
-        flavour: see `LaneSegmentMetrics`.
-    """
-
-    def __init__(
-        self,
-        groups: Sequence[str] | None = None,
-        *,
-        frame_groups: Sequence[str] = (),
-        lane_groups: Sequence[str] = (),
-        partition: Partition = BY_OCCLUSION,
-        flavour: Flavour = "LaneSegNet",
-    ) -> None:
-        make = partial(LaneSegmentMetrics, flavour)
-        super().__init__(make, partition, groups, frame_groups=frame_groups, lane_groups=lane_groups)
-
-    def update(
-        self,
-        detections: SegmentDetections,
-        truth: SegmentTruth,
-        frame_group: FrameGroup = None,
-        members: Mapping[str, Bool[np.ndarray, " g"]] | None = None,
-    ) -> None:
-        """Add one frame; arguments as of `GroupedMetrics.add`.
-
-        Raises UserError for arrays that do not fit together, or a visibility that is not known.
-        """
-        self.add(match_segments(detections, truth, nearest="all"), truth.lanes, frame_group, members)
 
 
 def _in_scope(values: dict[str, T], scope: Scope) -> dict[str, T]:

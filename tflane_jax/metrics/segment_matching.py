@@ -67,6 +67,16 @@ class SegmentTruth:
     left_type: Int[np.ndarray, " g"] | None = None
     right_type: Int[np.ndarray, " g"] | None = None
 
+    @property
+    def points(self) -> Lines:
+        """Centerlines, metres."""
+        return self.lanes.points
+
+    @property
+    def visibility(self) -> Float[np.ndarray, " g"] | None:
+        """Fraction of each segment in direct line of sight, 0 to 1; None where it is not known."""
+        return self.lanes.visibility
+
 
 @dataclass(frozen=True)
 class SegmentDetections:

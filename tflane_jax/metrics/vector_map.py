@@ -6,15 +6,14 @@ of their buffers. Rules: docs/reference/metrics.md, section 4. Matching: `metric
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from functools import partial
 from typing import Self
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from tflane_jax.errors import UserError
-from tflane_jax.metrics.groups import BY_OCCLUSION, FrameGroup, GroupedMetrics, Partition, Scope
+from tflane_jax.metrics.bootstrap import Weights, bootstrap_precisions, frame_numbers
+from tflane_jax.metrics.groups import Scope
 from tflane_jax.metrics.map_matching import (
     CLASSES,
     LINE_CLASSES,
@@ -29,8 +28,7 @@ from tflane_jax.metrics.map_matching import (
 )
 from tflane_jax.metrics.map_overlap import OVERLAP_THRESHOLDS
 from tflane_jax.metrics.matching import average_precision_area, pooled, ranked
-from tflane_jax.metrics.merging import joined
-from tflane_jax.metrics.resampling import Weights, frame_numbers, resampled_precisions
+from tflane_jax.metrics.merging import by_frame, joined
 
 _NAMES: dict[Measure, str] = {"chamfer": "MapTR Chamfer AP", "iou": "MapTR IoU AP"}
 _VERSIONS: dict[Sampling, str] = {"maptr": "v1", "maptrv2": "v2", "as_given": "v1, detections not resampled"}
@@ -54,15 +52,13 @@ class VectorMapMetrics:
         self.sampling: Sampling = sampling
         self.measure: Measure = measure
         self.dims: Dims = dims
-        self._frames = 0
-        self._truths = np.zeros(len(LINE_CLASSES), np.int64)
         self._detections: list[tuple[np.ndarray, ...]] = []  # of every frame: scores, classes, hits
         self._frame_truths: list[np.ndarray] = []  # of every frame: true lines by class
 
     @property
     def protocol(self) -> str:
         """Name and version, the title of every table of these numbers."""
-        classes = ", with centerlines" if self._truths[len(CLASSES)] else ""
+        classes = ", with centerlines" if self._truths[:, len(CLASSES)].any() else ""
         heights = ", with heights" if self.dims == 3 else ""
         return f"{_NAMES[self.measure]} {_VERSIONS[self.sampling]}{heights}{classes}"
 
@@ -75,10 +71,12 @@ class VectorMapMetrics:
         """Add one frame; raise UserError for arrays that do not fit together."""
         self.add(match_map(detections, truth, self.sampling, self.measure, dims=self.dims))
 
+    def match(self, detections: MapDetections, truth: MapTruth) -> MatchedMap:
+        """Match one frame for groups, with the nearest line of every detection, however far; raises as `update`."""
+        return match_map(detections, truth, self.sampling, self.measure, dims=self.dims, nearest="all")
+
     def add(self, frame: MatchedMap) -> None:
         """Add one frame that has been matched by this measure."""
-        self._frames += 1
-        self._truths += frame.truths
         self._frame_truths.append(frame.truths)
         self._detections.append((frame.scores, frame.classes.astype(np.int8), frame.hits))
 
@@ -105,26 +103,27 @@ class VectorMapMetrics:
           program prints it under its tables (0 if there is none). `mAP` is their mean only if no class is missing;
         - `recall`: fraction of the true lines that are found, whatever the confidence; mean over the thresholds.
         """
-        thresholds, measured = self.thresholds, np.flatnonzero(_counted(self._truths, scope))
+        thresholds, truths = self.thresholds, self._truths.sum(0)
         scores, classes, hits = ranked(*pooled(self._detections, (0,), (len(thresholds), 0)))
-        hits = hits.astype(bool)
+        hits, lines = hits.astype(bool), int(truths.sum())
+        measured = np.flatnonzero(_counted(truths, scope))
         precision = {
-            LINE_CLASSES[c]: [
-                average_precision_area(scores[members], row[members], int(self._truths[c])) for row in hits
-            ]
+            LINE_CLASSES[c]: [average_precision_area(scores[own], row[own], int(truths[c])) for row in hits]
             for c in measured
-            for members in [classes == c]
+            for own in [classes == c]
         }
-        table, present = np.array(list(precision.values())), max((self._truths[measured] > 0).sum(), 1)
-        lines = int(self._truths.sum())
-        whole = {"mAP": float(_mean_precision(table, np.ones(len(table), bool)))} if precision else {}
-        at_threshold = dict(zip(thresholds, table.sum(0) / present, strict=True)) if precision else {}
+        mean, at_threshold = {}, {}
+        if precision:
+            table = np.array(list(precision.values()))
+            mean["mAP"] = float(_mean_precision(table, np.ones(len(table), bool)))
+            present = max((truths > 0).sum(), 1)
+            at_threshold = {f"mAP@{t}": float(p) for t, p in zip(thresholds, table.sum(0) / present, strict=True)}
         return (
-            {"frames": self._frames, "lines": lines}
-            | whole
+            {"frames": len(self._frame_truths), "lines": lines}
+            | mean
             | {f"AP_{name}": float(np.mean(row)) for name, row in precision.items()}
             | {"recall": float(hits.sum() / max(len(thresholds) * lines, 1))}
-            | {f"mAP@{t}": float(value) for t, value in at_threshold.items()}
+            | at_threshold
             | {f"AP_{name}@{t}": row[k] for name, row in precision.items() for k, t in enumerate(thresholds)}
         )
 
@@ -132,23 +131,27 @@ class VectorMapMetrics:
         """Return no score: all but recall rank detections."""
         return {}
 
-    def resampled(self, weights: Weights, scope: Scope = "all") -> dict[str, Float[np.ndarray, " b"]]:
+    def bootstrap(self, weights: Weights, scope: Scope = "all") -> dict[str, Float[np.ndarray, " b"]]:
         """Return `mAP` and the `AP_...` of classes in samples that count the frames as often as `weights` says.
 
         Classes are those of `compute`. An AP that a sample lacks is 0, and does not count in its `mAP`.
         """
         scores, classes, hits = pooled(self._detections, (0,), (len(self.thresholds), 0))
-        truths = np.array(self._frame_truths, int).reshape(-1, len(LINE_CLASSES))
-        frame, precision = frame_numbers(self._detections), {}
-        measured = np.flatnonzero(_counted(self._truths, scope))
+        frame, truths, precision = frame_numbers(self._detections), self._truths, {}
+        measured = np.flatnonzero(_counted(truths.sum(0), scope))
         for c in measured:
             own = classes == c
-            _, area = resampled_precisions(scores[own], hits[:, own], frame[own], truths[:, c], weights)
+            _, area = bootstrap_precisions(scores[own], hits[:, own], frame[own], truths[:, c], weights)
             precision[f"AP_{LINE_CLASSES[c]}"] = area.mean(1)
         if not precision:
             return {}
         counted = _counted((weights @ truths).T, scope)[measured]
         return {"mAP": _mean_precision(np.stack(list(precision.values()))[:, None], counted)} | precision
+
+    @property
+    def _truths(self) -> Int[np.ndarray, "f 4"]:
+        """True lines of every frame by class."""
+        return by_frame(self._frame_truths, (len(LINE_CLASSES),), int)
 
 
 def _counted(truths: Int[np.ndarray, "4 *b"], scope: Scope) -> Bool[np.ndarray, "4 *b"]:
@@ -165,44 +168,3 @@ def _mean_precision(
     """Return the mean over the counted classes and over the thresholds; 0 where no class counts."""
     total = np.where(counted[:, None], precision, 0.0).sum((0, 1))
     return total / np.maximum(precision.shape[1] * counted.sum(0), 1)
-
-
-class GroupedMapMetrics(GroupedMetrics[MatchedMap]):
-    """The metric of all lines and of the groups of a partition, see `metrics.groups`.
-
-    Args:
-        groups, frame_groups, lane_groups: see `GroupedMetrics`; lines take the place of lanes.
-        partition: of the lines; default by occlusion.
-        sampling, dims, measure: see `VectorMapMetrics`.
-    """
-
-    def __init__(
-        self,
-        groups: Sequence[str] | None = None,
-        *,
-        frame_groups: Sequence[str] = (),
-        lane_groups: Sequence[str] = (),
-        partition: Partition = BY_OCCLUSION,
-        sampling: Sampling = "maptr",
-        dims: Dims = 2,
-        measure: Measure = "chamfer",
-    ) -> None:
-        self.sampling: Sampling = sampling
-        self.dims: Dims = dims
-        self.measure: Measure = measure
-        make = partial(VectorMapMetrics, sampling, measure, dims)
-        super().__init__(make, partition, groups, frame_groups=frame_groups, lane_groups=lane_groups)
-
-    def update(
-        self,
-        detections: MapDetections,
-        truth: MapTruth,
-        frame_group: FrameGroup = None,
-        members: Mapping[str, Bool[np.ndarray, " g"]] | None = None,
-    ) -> None:
-        """Add one frame; arguments as of `GroupedMetrics.add`.
-
-        Raises UserError for arrays that do not fit together, or a visibility that is not known.
-        """
-        frame = match_map(detections, truth, self.sampling, self.measure, dims=self.dims, nearest="all")
-        self.add(frame, truth, frame_group, members)

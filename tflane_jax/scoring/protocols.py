@@ -14,13 +14,13 @@ from tflane_jax.files import tusimple
 from tflane_jax.files.fields import PICKLE_SUFFIXES
 from tflane_jax.files.openlane import FrameKey
 from tflane_jax.metrics.f_score import CenterlineFScore
-from tflane_jax.metrics.groups import ByDistance
-from tflane_jax.metrics.lane_segment import Flavour, GroupedSegmentMetrics, LaneSegmentMetrics
+from tflane_jax.metrics.groups import ByDistance, GroupedMetrics, LaneMetrics
+from tflane_jax.metrics.lane_segment import Flavour, LaneSegmentMetrics
 from tflane_jax.metrics.map_matching import LINE_CLASSES, Dims, Measure, Sampling
-from tflane_jax.metrics.openlane_v2 import CenterlineMetrics, GroupedCenterlineMetrics
+from tflane_jax.metrics.openlane_v2 import CenterlineMetrics
 from tflane_jax.metrics.topology import Version
 from tflane_jax.metrics.tusimple import LSTR_TIME_LIMIT, OFFICIAL_TIME_LIMIT, TuSimpleMetrics
-from tflane_jax.metrics.vector_map import GroupedMapMetrics, VectorMapMetrics
+from tflane_jax.metrics.vector_map import VectorMapMetrics
 from tflane_jax.scoring import maptr, openlane_v2, plain, remarks
 from tflane_jax.scoring.recognise import Format, Side, hint
 from tflane_jax.scoring.score import Accumulator, numbers_of
@@ -88,55 +88,58 @@ def _plain_or(read_plain: Callable[[Path], Any], read_official: Callable[..., An
     return read
 
 
+def _groups(metrics: Callable[[], LaneMetrics]) -> dict[str, Callable[[], GroupedMetrics]]:
+    return {
+        "occlusion": partial(GroupedMetrics, metrics),
+        "distance": partial(GroupedMetrics, metrics, partition=ByDistance()),
+    }
+
+
 def _centerline(version: Version) -> ScoringProtocol:
+    metrics = partial(CenterlineMetrics, (version,))
     return ScoringProtocol(
         read_predictions=_plain_or(plain.read_predictions, openlane_v2.read_predictions),
         read_truth=_plain_or(plain.read_truth, openlane_v2.read_truth),
         scene_of=lambda key: key.scene,
-        metrics=partial(CenterlineMetrics, (version,)),
+        metrics=metrics,
         columns=("OLS", "DET_l", "DET_t", "TOP_ll", "TOP_lt"),
         formats=("OpenLane-V2 centerlines", "plain centerlines"),
         remarks=remarks.centerlines,
         found="recall",
-        groups={
-            "occlusion": partial(GroupedCenterlineMetrics, versions=(version,)),
-            "distance": partial(GroupedCenterlineMetrics, partition=ByDistance(), versions=(version,)),
-        },
+        groups=_groups(metrics),
     )
 
 
 def _lane_segment(flavour: Flavour, columns: tuple[str, ...]) -> ScoringProtocol:
+    metrics = partial(LaneSegmentMetrics, flavour)
     return ScoringProtocol(
         read_predictions=openlane_v2.read_segment_predictions,
         read_truth=partial(openlane_v2.read_segment_truth, flavour=flavour),
         scene_of=lambda key: key.scene,
-        metrics=partial(LaneSegmentMetrics, flavour),
+        metrics=metrics,
         columns=(*columns, "AE_type", "AE_dist"),
         formats=("OpenLane-V2 lane segments",),
         remarks=remarks.segments,
         found=columns[1],
-        groups={
-            "occlusion": partial(GroupedSegmentMetrics, flavour=flavour),
-            "distance": partial(GroupedSegmentMetrics, partition=ByDistance(), flavour=flavour),
-        },
+        groups=_groups(metrics),
     )
 
 
 def _maptr(sampling: Sampling, measure: Measure = "chamfer", dims: Dims = 2) -> ScoringProtocol:
-    grouped = partial(GroupedMapMetrics, sampling=sampling, measure=measure, dims=dims)
+    metrics = partial(VectorMapMetrics, sampling, measure, dims)
     return ScoringProtocol(
         read_predictions=partial(maptr.read_predictions, dims=dims),
         read_truth=partial(maptr.read_truth, dims=dims),
         scene_of=lambda token: token,
         no_scenes="MapTR's files do not say which drive a sample is of, and single samples are drawn",
-        metrics=partial(VectorMapMetrics, sampling, measure, dims),
+        metrics=metrics,
         columns=("mAP", *(f"AP_{name}" for name in LINE_CLASSES)),
         formats=("MapTR",),
         of_scene=lambda metrics: metrics.compute("frames"),
         remarks=remarks.units,
         found="mAP",
         frame="and are the classes right",
-        groups={"occlusion": grouped, "distance": partial(grouped, partition=ByDistance())},
+        groups=_groups(metrics),
     )
 
 

@@ -1,6 +1,7 @@
 """Metrics of bootstrap samples against the same metrics of data sets in which scenes are really repeated."""
 
 import dataclasses
+from functools import partial
 from unittest import mock
 
 import numpy as np
@@ -10,23 +11,22 @@ from hypothesis import strategies as st
 
 from tests.metrics.cases import random_frame
 from tests.metrics.segments import random_segments
+from tflane_jax.errors import UserError
 from tflane_jax.metrics import (
     CenterlineMetrics,
     ElementDetections,
     ElementTruth,
-    GroupedCenterlineMetrics,
-    GroupedMapMetrics,
-    GroupedSegmentMetrics,
+    GroupedMetrics,
     LaneSegmentMetrics,
     MapConsistency,
     MapDetections,
     MapTruth,
     VectorMapMetrics,
 )
-from tflane_jax.metrics import resampling as module
+from tflane_jax.metrics import bootstrap as module
+from tflane_jax.metrics.bootstrap import bootstrap_mean, bootstrap_precisions, frame_numbers
 from tflane_jax.metrics.map_matching import match_map
 from tflane_jax.metrics.matching import average_precision_11, average_precision_area
-from tflane_jax.metrics.resampling import frame_numbers, resampled_mean, resampled_precisions
 
 # Two frames a scene; the last sample lacks a scene that has a frame of its own kind.
 SCENE = np.array([0, 0, 1, 1, 2, 2])
@@ -46,7 +46,7 @@ def test_precisions_of_samples_are_those_of_repeated_detections(seed, count, fra
     truths = np.bincount(frame, hits.any(0), minlength=frames).astype(int) + rng.integers(0, 3, frames)
     weights = np.vstack([np.ones(frames, int), np.zeros(frames, int), rng.integers(0, 4, (5, frames))])
     with mock.patch.object(module, "_BLOCK", 1 if seed % 2 else 2**22):
-        found = resampled_precisions(scores, hits, frame, truths, weights)
+        found = bootstrap_precisions(scores, hits, frame, truths, weights)
     for b, weight in enumerate(weights):
         times = weight[frame]
         for k, row in enumerate(hits):
@@ -57,7 +57,7 @@ def test_precisions_of_samples_are_those_of_repeated_detections(seed, count, fra
 
 def test_a_mean_without_anything_to_count_is_zero():
     parts = np.array([[0.5, 2.0], [0.0, 0.0]])
-    np.testing.assert_allclose(resampled_mean(parts, np.array([[2, 1], [0, 2]])), [0.25, 0.0])
+    np.testing.assert_allclose(bootstrap_mean(parts, np.array([[2, 1], [0, 2]])), [0.25, 0.0])
 
 
 def test_frames_of_pooled_detections():
@@ -121,12 +121,16 @@ def update_groups(metrics, number, make):
 GROUPS = {"frame_groups": ("near", "far"), "lane_groups": ("odd",)}
 CASES = {
     "centerlines": (lambda: CenterlineMetrics(("v2.1", "v1.0")), update, centerlines),
-    "centerlines, groups": (lambda: GroupedCenterlineMetrics(**GROUPS), update_groups, centerlines),
+    "centerlines, groups": (lambda: GroupedMetrics(CenterlineMetrics, **GROUPS), update_groups, centerlines),
     "segments": (lambda: LaneSegmentMetrics("LaneSegNet"), update, segments),
     "segments, devkit": (LaneSegmentMetrics, update, segments),
-    "segments, groups": (lambda: GroupedSegmentMetrics(**GROUPS), update_groups, segments),
+    "segments, groups": (
+        lambda: GroupedMetrics(partial(LaneSegmentMetrics, "LaneSegNet"), **GROUPS),
+        update_groups,
+        segments,
+    ),
     "lines": (VectorMapMetrics, update, lines),
-    "lines, groups": (lambda: GroupedMapMetrics(("all",), **GROUPS), update_groups, lines),
+    "lines, groups": (lambda: GroupedMetrics(VectorMapMetrics, ("all",), **GROUPS), update_groups, lines),
     "lines without centerlines": (VectorMapMetrics, update, lambda number: lines(number, centerlines=False)),
 }
 NAMES_OF = {
@@ -154,9 +158,9 @@ def test_a_sample_has_the_numbers_of_scenes_that_are_really_repeated(case):
     metrics = make()
     for number in range(len(SCENE)):
         add(metrics, number, frame)
-    resampled = flat(metrics.resampled(WEIGHTS[:, SCENE]))
+    samples = flat(metrics.bootstrap(WEIGHTS[:, SCENE]))
     expected_names = NAMES_OF[case]
-    assert expected_names <= set(resampled) if "groups" in case else expected_names == set(resampled)
+    assert expected_names <= set(samples) if "groups" in case else expected_names == set(samples)
     for b, times in enumerate(WEIGHTS):
         again = make()
         for scene in np.repeat(np.arange(3), times):
@@ -164,18 +168,18 @@ def test_a_sample_has_the_numbers_of_scenes_that_are_really_repeated(case):
                 add(again, number, frame)
         expected = flat(again.compute())
         # Without centerlines there is no class of them, and without frames of a group fewer of its numbers.
-        assert times.min() == 0 or resampled.keys() <= expected.keys()
-        for name in resampled.keys() & expected.keys():
-            assert resampled[name][b] == pytest.approx(expected[name], abs=1e-12), (name, times)
-        spread = {name for name in resampled if np.ptp(resampled[name]) > 1e-3}
-        assert len(spread) > len(resampled) / 2
+        assert times.min() == 0 or samples.keys() <= expected.keys()
+        for name in samples.keys() & expected.keys():
+            assert samples[name][b] == pytest.approx(expected[name], abs=1e-12), (name, times)
+        spread = {name for name in samples if np.ptp(samples[name]) > 1e-3}
+        assert len(spread) > len(samples) / 2
     parts = make(), make()
     for number, scene in enumerate(SCENE):
         add(parts[int(scene > 0)], number, frame)
     merged = parts[0].merge(parts[1])
-    of_merged = flat(merged.resampled(WEIGHTS[:, SCENE]))
-    assert of_merged.keys() == resampled.keys()
-    for name, values in resampled.items():
+    of_merged = flat(merged.bootstrap(WEIGHTS[:, SCENE]))
+    assert of_merged.keys() == samples.keys()
+    for name, values in samples.items():
         np.testing.assert_array_equal(of_merged[name], values, err_msg=name)
 
 
@@ -191,11 +195,21 @@ def test_consistency_of_samples():
                 metrics.add(matched, identities, np.arange(count[1]))
         return metrics
 
-    resampled = run(range(3)).resampled(WEIGHTS[:, SCENE])
-    assert np.ptp(resampled["C-mAP"]) > 0.01
+    samples = run(range(3)).bootstrap(WEIGHTS[:, SCENE])
+    assert np.ptp(samples["C-mAP"]) > 0.01
     for b, times in enumerate(WEIGHTS):
         expected = run(np.repeat(np.arange(3), times)).compute()
-        assert {name: values[b] for name, values in resampled.items()} == pytest.approx(expected, abs=1e-12)
+        assert {name: values[b] for name, values in samples.items()} == pytest.approx(expected, abs=1e-12)
+
+
+def test_elements_that_some_frames_lack_have_no_samples():
+    """Of their detections, the frames would be wrong."""
+    metrics = CenterlineMetrics()
+    detections, truth = centerlines(0)
+    metrics.update(dataclasses.replace(detections, elements=None), truth)
+    metrics.update(*centerlines(1))
+    with pytest.raises(UserError, match="traffic elements are missing in 1 of 2 frames"):
+        metrics.bootstrap(np.ones((1, 2), int))
 
 
 def test_means_are_the_scores():

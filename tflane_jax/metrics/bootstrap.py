@@ -26,13 +26,13 @@ def frame_numbers(detections: Sequence[tuple[np.ndarray, ...]]) -> Int[np.ndarra
     return np.repeat(np.arange(len(detections)), [len(scores) for scores, *_ in detections])
 
 
-def resampled_mean(parts: Float[np.ndarray, "f 2"], weights: Weights) -> Float[np.ndarray, " b"]:
+def bootstrap_mean(parts: Float[np.ndarray, "f 2"], weights: Weights) -> Float[np.ndarray, " b"]:
     """Return the ratio of two sums over frames in each sample; 0 where there is nothing to count."""
     total, count = weights @ parts[:, 0], weights @ parts[:, 1]
     return total / np.where(count, count, 1.0)
 
 
-def resampled_precisions(
+def bootstrap_precisions(
     scores: Float[np.ndarray, " p"],
     hits: Shaped[np.ndarray, "k p"],
     frame: Int[np.ndarray, " p"],

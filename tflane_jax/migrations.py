@@ -250,4 +250,5 @@ MIGRATIONS: tuple[Migration, ...] = (
     unused_setting("SegmentDecoderConfig", "edge_weight"),
     unused_setting("MapTrLossConfig", "cell_weight"),
     unused_setting("MapTrV2LossConfig", "cell_weight"),
+    removed_setting("LaneSegNetLossConfig", "successor_mean", "negatives"),
 )

@@ -14,8 +14,8 @@ Generated roads are those of the preset `real-like`, which was fitted to mean st
 from dataclasses import replace
 
 from tflane_jax.config import RealMapData, RunConfig, load_config
+from tflane_jax.models.raster_fusion import TrafficRasterConfig
 from tflane_jax.models.toponet import TopoNetConfig
-from tflane_jax.models.traffic_raster import TrafficRasterConfig
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.world.presets import CITY, REAL_LIKE
 

@@ -9,6 +9,7 @@ import pytest
 from tflane_jax.config import RunConfig
 from tflane_jax.config_io import added_settings, first_difference, from_json, to_json
 from tflane_jax.errors import UserError
+from tflane_jax.losses.lanesegnet import LaneSegNetLossConfig
 from tflane_jax.losses.maptr import MapTrLossConfig
 from tflane_jax.losses.maptrv2 import MapTrV2LossConfig
 from tflane_jax.migrations import (
@@ -187,6 +188,16 @@ def test_workers_of_the_former_default_are_those_of_the_machine(threads, ahead, 
     old["data"]["loading"] |= {"threads": threads, "ahead": ahead}
     loading = migrate(old)[0]["data"]["loading"]
     assert (loading["threads"], loading["ahead"]) == expected
+
+
+def test_the_mean_of_the_segments_topology_is_the_published_one():
+    old = to_json(RunConfig(LaneGraphTask(LaneSegNetConfig(), LaneSegNetLossConfig())))
+    assert "successor_mean" not in old["task"]["losses"]
+    losses = {mean: old["task"]["losses"] | {"successor_mean": mean} for mean in ("negatives", "pairs")}
+    read = migrate(old | {"task": old["task"] | {"losses": losses["negatives"]}})[0]
+    assert read == old
+    with pytest.raises(UserError, match=r"losses\.successor_mean is pairs"):
+        migrate(old | {"task": old["task"] | {"losses": losses["pairs"]}})
 
 
 def test_new_settings_are_listed_with_their_defaults():

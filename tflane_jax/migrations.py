@@ -257,4 +257,5 @@ MIGRATIONS: tuple[Migration, ...] = (
     unused_setting("MapTrLossConfig", "cell_weight"),
     unused_setting("MapTrV2LossConfig", "cell_weight"),
     _at_class("StreamingConfig", _former_workers),
+    removed_setting("LaneSegNetLossConfig", "successor_mean", "negatives"),
 )

@@ -16,8 +16,8 @@ from typing import Any
 
 from tflane_jax.config import RunConfig, load_config
 from tflane_jax.models.marker_fusion import SMALL_MARKER_FUSION, MarkerFusionConfig, as_written, uniform_fusion
-from tflane_jax.models.marker_raster import MarkerRasterConfig
 from tflane_jax.models.priors import PriorsConfig
+from tflane_jax.models.raster_fusion import MarkerRasterConfig
 from tflane_jax.models.sd_map_encoder import SMALL_SD_MAP
 from tflane_jax.models.traffic_flow_module import TrafficFlowConfig
 from tflane_jax.tasks.lane_graph import LaneGraphTask

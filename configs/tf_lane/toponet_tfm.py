@@ -16,6 +16,7 @@ from typing import Literal
 
 from tflane_jax.config import RunConfig, load_config
 from tflane_jax.models.priors import PriorsConfig
+from tflane_jax.models.raster_fusion import TrafficRasterConfig
 from tflane_jax.models.traffic_flow_module import (
     ALL_FUSIONS,
     LANE_FUSIONS,
@@ -23,7 +24,6 @@ from tflane_jax.models.traffic_flow_module import (
     TrafficFlowConfig,
     TrafficFlowModuleConfig,
 )
-from tflane_jax.models.traffic_raster import TrafficRasterConfig
 from tflane_jax.priors.traffic_flow import TrafficFlowPriorConfig
 
 

@@ -9,8 +9,8 @@ from tests.golden import case_id, golden_modules, load_module_case, numbered
 from tflane_jax.geometry.line_orders import order_indices, point_orders
 from tflane_jax.geometry.polylines import resample_lines
 
+# v0 is left out, see `geometry.line_orders`.
 PATTERNS = {
-    "v0": {"closing": "rolled"},
     "v1": {},
     "v4": {"ways": "both"},
     "v2": {},
@@ -36,7 +36,7 @@ def test_orders_are_those_of_the_reference(path):
     closed = np.array([np.array_equal(line[0], line[-1]) for line in vertices])
     # A directed class exists in MapTRv2 only.
     directed = (case.inputs["labels"] == CENTERLINE) & ("maptrv2" in case.source)
-    patterns = {name.removeprefix("shift_") for name in case.outputs if name.startswith("shift_")}
+    patterns = {name.removeprefix("shift_") for name in case.outputs if name.startswith("shift_")} - {"v0"}
     assert patterns <= PATTERNS.keys()
     for pattern in patterns:
         expected = case.outputs[f"shift_{pattern}"]

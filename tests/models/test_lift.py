@@ -21,7 +21,7 @@ from tflane_jax.losses.map_masks import depth_targets
 from tflane_jax.losses.maptrv2 import depth_loss
 from tflane_jax.models.auxiliary import LineMaskHead
 from tflane_jax.models.lift import LiftConfig, LiftEncoder, camera_vector, cell_numbers, collect, ray_points
-from tflane_jax.models.traffic_raster import TrafficRasterConfig, TrafficRasterFusion
+from tflane_jax.models.raster_fusion import RasterFusion, TrafficRasterConfig
 from tflane_jax.priors.traffic_raster import CHANNELS, TrafficRaster
 from tflane_jax.scene import CameraViews, VehicleState
 
@@ -252,7 +252,9 @@ def test_a_prior_without_data_changes_no_bit_of_the_features():
 
     def fuse_of(touched):
         raster = TrafficRaster(noise, touched)
-        return lambda layer, places, bev, position: TrafficRasterFusion(RASTER, name="prior")(bev, raster)
+        return lambda layer, places, bev, position: RasterFusion(RASTER.hidden, name="prior")(
+            bev, raster.features, raster.touched
+        )
 
     start = lambda key: model.init(key, [features], views, train=False, fuse=fuse_of(jnp.ones(32, bool)))  # noqa: E731
     fresh = jax.eval_shape(start, jax.random.key(0))

@@ -26,8 +26,8 @@ from tflane_jax.models.marker_fusion import (
     fusion_gate,
     uniform_fusion,
 )
-from tflane_jax.models.marker_raster import MarkerRasterConfig
 from tflane_jax.models.prior import BevCells
+from tflane_jax.models.raster_fusion import MarkerRasterConfig
 from tflane_jax.priors.marker_memory import MarkerGuidance
 
 VARIANTS = {

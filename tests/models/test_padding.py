@@ -32,8 +32,8 @@ from tflane_jax.models.lane_queries import LaneProposalConfig
 from tflane_jax.models.maptrv2 import MapTrV2Config
 from tflane_jax.models.marker_fusion import SMALL_MARKER_FUSION
 from tflane_jax.models.priors import PriorsConfig
+from tflane_jax.models.raster_fusion import TrafficRasterConfig
 from tflane_jax.models.sd_map_encoder import SMALL_SD_MAP
-from tflane_jax.models.traffic_raster import TrafficRasterConfig
 from tflane_jax.scene import MarkerObservations, SdMap
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 

@@ -22,6 +22,7 @@ from tests.models.toy_prior import CrossingsConfig, with_crossings
 from tests.parameters import random_params
 from tests.shared import assert_same
 from tests.slow import with_slow
+from tflane_jax.limits import Rules, SettingError, splits
 from tflane_jax.models.bevformer_detr import BevFormerDetrConfig
 from tflane_jax.models.prior import HostQueries, HostSpec
 from tflane_jax.models.priors import PriorsConfig, encode, fuse_into_queries, observe, observe_clip
@@ -38,6 +39,15 @@ class WithToy(PriorsConfig):
     crossings: CrossingsConfig | None = None
 
 
+@dataclass(frozen=True)
+class Demanding(CrossingsConfig):
+    """A prior with rules for its host."""
+
+    def host_limits(self, host: HostSpec) -> Rules:
+        yield splits("width", self.width, "the channels of a query", host.dim)
+        yield "width", self.width == host.bev_dim, f"{host.bev_dim}, the channels of BEV features"
+
+
 FLOW = TrafficFlowConfig(
     prior=TrafficFlowPriorConfig(max_instances=5), module=TrafficFlowModuleConfig(width=8, heads=2, bands=3)
 )
@@ -52,6 +62,15 @@ HOSTS = {
     "lanesegnet": (SEGMENTS, make_example),
     "camera lanesegnet": (replace(SEGMENTS, encoder=CAMERA), make_camera_example),
 }
+
+
+@pytest.mark.parametrize("name", HOSTS)
+@pytest.mark.parametrize(("width", "rule"), [(3, "a divisor of the channels of a query"), (1, "[0-9]+, the channels")])
+def test_what_a_new_prior_demands_is_checked_by_every_host(name, width, rule):
+    """Regression: the hosts themselves named the priors for which they had rules."""
+    host = replace(HOSTS[name][0], priors=WithToy(crossings=Demanding(width=width)))
+    with pytest.raises(SettingError, match=rf"priors\.crossings\.width is {width}: it must be {rule}"):
+        host.build()
 
 
 @pytest.mark.parametrize("name", with_slow(HOSTS, quick=("toponet", "detr")))

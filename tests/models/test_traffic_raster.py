@@ -19,8 +19,8 @@ from tests.parameters import random_params
 from tests.shared import assert_same
 from tflane_jax.errors import UserError
 from tflane_jax.models.priors import PriorsConfig, bev_hook
+from tflane_jax.models.raster_fusion import RasterFusion, TrafficRasterConfig
 from tflane_jax.models.traffic_flow_module import TrafficFlowConfig
-from tflane_jax.models.traffic_raster import TrafficRasterConfig, TrafficRasterFusion
 from tflane_jax.priors.traffic_raster import CHANNELS, TrafficRaster
 from tflane_jax.scene import TrafficFlow, stack_examples
 from tflane_jax.tasks.lane_graph import LaneGraphTask
@@ -71,16 +71,17 @@ def test_absent_traffic_gives_the_host_without_the_prior(host, make):
 def test_a_new_fusion_changes_nothing():
     """The output layer starts at zero."""
     bev, raster = cells(0)
-    fusion = TrafficRasterFusion(RASTER)
-    fused, params = fusion.init_with_output(jax.random.key(0), bev, raster)
+    fusion = RasterFusion(RASTER.hidden)
+    fused, params = fusion.init_with_output(jax.random.key(0), bev, raster.features, raster.touched)
     np.testing.assert_array_equal(fused, bev)
     assert not np.asarray(params["params"]["output"]["kernel"]).any()
 
 
 def test_only_cells_with_traffic_change():
     bev, raster = cells(1)
-    fusion = TrafficRasterFusion(RASTER)
-    fused = fusion.apply(random_params(fusion.init, bev, raster), bev, raster)
+    fusion = RasterFusion(RASTER.hidden)
+    arguments = bev, raster.features, raster.touched
+    fused = fusion.apply(random_params(fusion.init, *arguments), *arguments)
     changed = (np.asarray(fused) != np.asarray(bev)).any(-1)
     np.testing.assert_array_equal(changed, raster.touched)
 

@@ -36,9 +36,9 @@ from tflane_jax.models.map_lines import LineDecoderConfig
 from tflane_jax.models.maptr import MapTrConfig
 from tflane_jax.models.marker_fusion import MarkerFusionConfig
 from tflane_jax.models.priors import PriorsConfig
+from tflane_jax.models.raster_fusion import TrafficRasterConfig
 from tflane_jax.models.toponet import TopoNetConfig
 from tflane_jax.models.traffic_flow_module import TrafficFlowConfig
-from tflane_jax.models.traffic_raster import TrafficRasterConfig
 from tflane_jax.scene import Prediction, shapes_of, stack_examples
 from tflane_jax.tasks import lane_graph
 from tflane_jax.tasks.lane_graph import LaneGraphTask

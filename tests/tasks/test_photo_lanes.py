@@ -23,6 +23,11 @@ def curves(feet, horizon, ahead=0.5, upper=None):
     return np.array(rows)
 
 
+def in_view(view, pixels):
+    """Return columns and rows of the photo as fractions of the view: `Placement.to_photo` backwards."""
+    return (pixels - (view.left, view.top)) / (view.width, view.height)
+
+
 @pytest.fixture
 def network(monkeypatch):
     """Answer every view with the lanes that it shows: straight ones through the horizon of the drawn road."""
@@ -30,8 +35,8 @@ def network(monkeypatch):
 
     def predict(task, params, examples):
         view = answers["views"][-1]
-        ahead, horizon = view.to_network(TRUE.to_photo(np.array([0.5, HORIZON])))
-        feet = view.to_network(TRUE.to_photo(np.stack([FEET, np.ones(4)], -1)))
+        ahead, horizon = in_view(view, TRUE.to_photo(np.array([0.5, HORIZON])))
+        feet = in_view(view, TRUE.to_photo(np.stack([FEET, np.ones(4)], -1)))
         # The lanes' columns at the lower end of the view.
         at_end = ahead + (feet[:, 0] - ahead) * (1.0 - horizon) / (feet[:, 1] - horizon)
         logit = np.log(answers["scores"] / (1.0 - answers["scores"]))

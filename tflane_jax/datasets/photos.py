@@ -64,10 +64,6 @@ class Placement:
         """Return points (u, v), fractions of the network's image, as columns and rows of the photo."""
         return np.asarray(points, np.float64) * (self.width, self.height) + (self.left, self.top)
 
-    def to_network(self, points: Float[np.ndarray, "*b 2"]) -> Float[np.ndarray, "*b 2"]:
-        """Return columns and rows of the photo as fractions (u, v) of the network's image."""
-        return (np.asarray(points, np.float64) - (self.left, self.top)) / (self.width, self.height)
-
 
 class FittedPhoto(NamedTuple):
     """A photo as the network's input: image, valid pixels (all), and the placement that maps points back."""

@@ -34,7 +34,8 @@ def image_sine_encoding(
 ) -> Float[Array, "h w f"]:
     """Return DETR's sine encoding of the cells of a feature map, f = 2 bands: [row | column], each sine, cosine, ...
 
-    Rows and columns are counted among valid cells, from 1.
+    Rows and columns are counted among valid cells, from 1. Every option is one of the code of DETR and mmdet, for
+    weights trained with it. All published systems here normalise, at a temperature of 10,000.
 
     Args:
         valid: cells that show the image, not padding.

@@ -27,6 +27,9 @@ class TransformerConfig:
         dropout: probability for attention weights, hidden channels and each residual branch.
         norm_first: pre-norm (normalise the input of each residual branch) instead of post-norm (normalise the sum).
         activation: of the hidden channels; "gelu" is the exact one, with the error function, as in PyTorch.
+
+    Both are options of PyTorch's layers and of DETR's and LSTR's code, for weights trained with them; the defaults are
+    those of every published system here.
     """
 
     heads: Count = 2

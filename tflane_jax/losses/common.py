@@ -94,18 +94,17 @@ def matched_edge_sums(
     columns: Assignment,
     edges: Bool[Array, "b n m"],
     loss: tuple[float, float],
-    mean: Literal["negatives", "pairs"],
 ) -> tuple[Float[Array, " b"], Float[Array, " b"]]:
     """Return the sum of the focal loss over pairs of matched queries, and what it is divided by, for each example.
 
-    Pairs with an unmatched query do not count: LaneSegNet's relationship head (docs/reference/lanesegnet.md).
+    The divisor is the number of pairs without an edge, as in the published code. Pairs with an unmatched query do not
+    count: LaneSegNet's relationship head (docs/reference/lanesegnet.md).
 
     Args:
         logits: predicted edges of one layer.
         rows, columns: assignments (B, N) and (B, M) of that layer.
         edges: true edges between targets.
         loss: alpha and gamma of the focal loss.
-        mean: whether pairs without an edge are counted, "negatives", or all "pairs".
     """
 
     def one(logits, rows, columns, edges):
@@ -113,8 +112,7 @@ def matched_edge_sums(
         edges = edges & pairs
         found = logits[rows.query[:, None], columns.query[None]]
         each = focal(found, edges.astype(logits.dtype), *loss)
-        counted = pairs & ~edges if mean == "negatives" else pairs
-        return jnp.where(pairs, each, 0.0).sum(), counted.sum().astype(jnp.float32)
+        return jnp.where(pairs, each, 0.0).sum(), (pairs & ~edges).sum().astype(jnp.float32)
 
     return jax.vmap(one)(logits, rows, columns, edges)
 

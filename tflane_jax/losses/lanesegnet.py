@@ -64,8 +64,6 @@ class LaneSegNetLossConfig(LaneWeights, HostLossConfig):
         type_weight: of the line types of either boundary.
         dice_cost: the dice cost takes the masks' "logits", as the published configuration does, or their
             "probabilities", as the dice loss does.
-        successor_mean: of both topologies: the sum over matched pairs is divided by the number of "negatives", the
-            pairs without an edge, as in the published code, or of all "pairs".
         raster: of the mask targets.
         areas: weights of areas, where the model predicts them.
         others: see `LaneWeights`. Points are those of all three lines. The loss of both topologies is that of the
@@ -76,7 +74,6 @@ class LaneSegNetLossConfig(LaneWeights, HostLossConfig):
     dice_weight: PositiveOrZero = 3.0
     type_weight: PositiveOrZero = 0.1
     dice_cost: Literal["logits", "probabilities"] = "logits"
-    successor_mean: Literal["negatives", "pairs"] = "negatives"
     raster: Raster = "cells"
     areas: AreaLossConfig = AreaLossConfig()
 
@@ -132,7 +129,6 @@ class LaneSegNetLossConfig(LaneWeights, HostLossConfig):
             _last(found),
             edges,
             (self.alpha, self.gamma),
-            self.successor_mean,
         )
         terms["element_lane"] = _pair_mean(self.element_lane_weight, losses, counts, self.class_mean)[None]
         return total(terms), last_layer(terms) | {"matching/elements": matched(found)}
@@ -273,9 +269,7 @@ def successor_loss(
     Pairs with an unmatched query or a crossing do not count.
     """
     lanes = _of_lanes(assignment, targets)
-    losses, counts = matched_edge_sums(
-        logits, lanes, lanes, targets.successor, (config.alpha, config.gamma), config.successor_mean
-    )
+    losses, counts = matched_edge_sums(logits, lanes, lanes, targets.successor, (config.alpha, config.gamma))
     return _pair_mean(config.successor_weight, losses, counts, config.class_mean)
 
 

@@ -14,7 +14,7 @@ from flax import struct
 from jaxtyping import Array, Float
 
 from tflane_jax.geometry import PerceptionRange
-from tflane_jax.limits import Rules, splits
+from tflane_jax.limits import Rules
 from tflane_jax.models.auxiliary import AuxiliaryName
 from tflane_jax.models.bev_encoder import BevMemory
 from tflane_jax.models.element_decoder import ElementDecoder, ElementDecoderConfig, ElementOutput
@@ -72,16 +72,10 @@ class HostConfig:
     """What a query represents, see `HostSpec.query_type`."""
 
     def limits(self) -> Rules:
-        """Channels of queries and BEV features split over the heads of the priors."""
-        flow, encoder = self.priors.traffic_flow, self.encoder
-        if flow is not None and flow.insert != "nowhere":
-            heads = flow.module.heads
-            yield splits("priors.traffic_flow.module.heads", heads, "the channels of a query", self.query_dim)
-        width = encoder.dim if isinstance(encoder, EvidenceEncoderConfig) else encoder.bev.dim
-        for name in ("sd_map", "markers"):
-            prior = getattr(self.priors, name)
-            if prior is not None and prior.width is None:
-                yield splits(f"priors.{name}.heads", prior.heads, "the channels of BEV features", width)
+        """What the priors demand of their host."""
+        for name, prior in self.priors.configured.items():
+            for setting, fits, wanted in getattr(prior, "host_limits", lambda host: ())(self.spec):
+                yield f"priors.{name}.{setting}", fits, wanted
 
     @property
     def query_dim(self) -> int:
@@ -114,9 +108,14 @@ class HostConfig:
         return self.encoder.bev_range
 
     @property
+    def bev_dim(self) -> int:
+        """Channels of the BEV features."""
+        return self.encoder.dim if isinstance(self.encoder, EvidenceEncoderConfig) else self.encoder.bev.dim
+
+    @property
     def spec(self) -> HostSpec:
         """The properties of the host that priors depend on."""
-        return HostSpec(self.query_dim, self.range, self.encoder.bev_range, self.query_type)
+        return HostSpec(self.query_dim, self.range, self.encoder.bev_range, self.query_type, bev_dim=self.bev_dim)
 
     def in_host_frame(self, example: Example) -> Example:
         """Return the example in the host's own frame, for the encoder."""

@@ -18,14 +18,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from tflane_jax.geometry import PerceptionRange
-from tflane_jax.layers.attention import MultiHeadAttention
 from tflane_jax.layers.graph import Mlp
 from tflane_jax.layers.masks import key_mask, radius_mask
 from tflane_jax.layers.polyline_encoder import MARKER_POLYLINES, PolylineEncoder, PolylineEncoderConfig
-from tflane_jax.layers.precision import Precision, computing, full, run_part
-from tflane_jax.limits import Count, Fraction, Positive, Rules, splits
-from tflane_jax.models.marker_raster import MarkerRasterConfig, MarkerRasterFusion
+from tflane_jax.layers.precision import computing, full, run_part
+from tflane_jax.limits import Fraction
 from tflane_jax.models.prior import BevCells, HostSpec, Prior
+from tflane_jax.models.raster_fusion import MarkerRasterConfig, RasterFusion
+from tflane_jax.models.token_fusion import TokenFusionConfig, attend_to_tokens
 from tflane_jax.priors.marker_memory import (
     MarkerGuidance,
     MarkerMemory,
@@ -39,7 +39,7 @@ from tflane_jax.scene import Example, MarkerObservations
 
 
 @dataclass(frozen=True)
-class MarkerFusionConfig:
+class MarkerFusionConfig(TokenFusionConfig):
     """The module. The defaults have the paper's sizes, and Eq. (3) for hosts that also run without markers.
 
     `as_written` is Eq. (3) to the letter; `SMALL_MARKER_FUSION` trains on two CPU cores.
@@ -55,22 +55,19 @@ class MarkerFusionConfig:
             whose own confidence is below `hard_threshold` (Table II). c is only the factor in Eq. (3): confidence also
             scales tokens (Eq. 4) and decides when memory is read. `uniform_fusion` removes it from there too.
         hard_threshold: lowest confidence at which "hard" uses markers; the paper gives none.
-        heads: of the attention to the tokens; the paper gives those of the line encoder alone.
-        width: channels of that attention; None: those of the BEV features.
+        heads: see `TokenFusionConfig`; the paper gives those of the line encoder alone.
         norm: position of the LayerNorm in Eq. (3). "written": around the sum, in every frame, so that a host without
             markers in sight differs from one without this module. "sum": the same in frames with lanes of markers;
             others stay as they are. "query": on the attention's queries, F + c Attn(LayerNorm(F), ..), with a
             zero-initialised output, so that training can continue from a host without markers. BEVFormer normalises its
             features before the fusion; the evidence encoder does not, and for a host trained without markers, Eq. (3)
             as written changes all features at once.
-        radius: a BEV cell attends only to lanes that pass within this many metres. None: to all lanes, as in Eq. (3);
-            the cell must then learn from the tokens which lanes are near, which takes small models too long.
+        width, radius: see `TokenFusionConfig`; without a radius, cells attend to all lanes, as in Eq. (3).
         query_position: add position encodings to the attention's queries. Eq. (3) has none, SMERF has; without, BEV
             features from convolutions carry no positions.
         bev: also write the lanes into the BEV cells that they pass, before Eq. (3), which is ours; None: Eq. (3) alone.
         connectivity: lanes exchange messages with their successors and predecessors (the paper's future work).
-        precision: dtype of linear layers, see `layers.precision`; parameters, tokens and results are float32.
-        remat: recompute the activations of each layer and of each fusion for the gradient instead of keeping them.
+        precision, remat: see `TokenFusionConfig`.
     """
 
     prior: MarkerPriorConfig = MarkerPriorConfig()
@@ -79,20 +76,9 @@ class MarkerFusionConfig:
     lines: PolylineEncoderConfig = MARKER_POLYLINES
     fusion: Literal["gated", "uniform", "hard"] = "gated"
     hard_threshold: Fraction = 0.5
-    heads: Count = 4
-    width: Count | None = None
-    norm: Literal["written", "sum", "query"] = "sum"
-    radius: Positive | None = None
     query_position: bool = True
     bev: MarkerRasterConfig | None = None
     connectivity: bool = False
-    precision: Precision = "float32"
-    remat: bool = False
-
-    def limits(self) -> Rules:
-        """Channels of the attention split over heads."""
-        if self.width is not None:
-            yield splits("heads", self.heads, "width", self.width)
 
     def build(self, host: HostSpec) -> MarkerPrior:
         """Return the prior for a host."""
@@ -186,10 +172,11 @@ class MarkerPrior(Prior):
     def into_bev(self, tokens: FusedMarkers, layer: int, cells: BevCells) -> Float[Array, "q c"]:
         """Return Eq. (3), after the lanes were written into their cells if `MarkerFusionConfig.bev` is set."""
         features, raster_config = cells.features, self.config.bev
-        if raster_config is not None and (layer == 0 or raster_config.layers == "all"):
+        if raster_config is not None and raster_config.enters(layer):
             lanes = replace(tokens.lanes, gate=tokens.gate)
             raster = rasterise_markers(lanes, tokens.valid, cells.grid, raster_config.between)
-            features = MarkerRasterFusion(raster_config, name=f"marker_cells_{layer}")(features, raster)
+            fuse = RasterFusion(raster_config.hidden, name=f"marker_cells_{layer}")
+            features = fuse(features, raster.features, raster.trust > 0.0, raster.trust)
         fusion = MarkerFusion(self.config, name=f"markers_{layer}")
         mask = fusion_mask(tokens.lanes, tokens.valid, cells.centers, self.config)
         return fusion(features, cells.position, tokens.tokens, mask, tokens.gate)
@@ -272,16 +259,9 @@ class MarkerFusion(nn.Module):
 
     def _fuse(self, bev, position, tokens, mask, gate) -> Float[Array, "q c"]:
         """Return Eq. (3); called by the compact method."""
-        config, channels = self.config, bev.shape[-1]
-        norm, added = nn.LayerNorm(epsilon=1e-5, name="norm"), config.norm == "query"
-        query = norm(bev) if added else bev
-        attention = MultiHeadAttention(
-            config.width or channels, config.heads, out=channels, zero_init=added, name="attention"
-        )
-        found = attention(query + position if config.query_position else query, tokens, tokens, mask)
-        fused = bev + gate * found
-        after = fused if added else norm(fused)  # Eq. (3)
-        return after if config.norm == "written" else jnp.where(mask.any(), after, bev)
+        config, place = self.config, position if self.config.query_position else None
+        fused = attend_to_tokens(config, bev, place, tokens, mask, change=lambda found: gate * found)
+        return fused if config.norm == "written" else jnp.where(mask.any(), fused, bev)
 
 
 def fusion_gate(lanes: MarkerGuidance, config: MarkerFusionConfig) -> tuple[Float[Array, ""], Bool[Array, " n"]]:

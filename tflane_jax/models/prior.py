@@ -34,6 +34,7 @@ class HostSpec:
         bev_range: the box that the BEV features cover and that normalised coordinates span, metres.
         query_type: a query represents a whole lane ("instance": TopoNet, LaneSegNet) or one of its points ("point":
             MapTR), see TF-Lane, Eq. (3).
+        bev_dim: channels of the BEV features; None for a prior that is used without them.
         forward: axis of the host's frame that points ahead of the vehicle; "y" in the axes of nuScenes' lidar.
     """
 
@@ -42,6 +43,7 @@ class HostSpec:
     bev_range: PerceptionRange
     query_type: Literal["instance", "point"] = "instance"
     forward: Literal["x", "y"] = "x"
+    bev_dim: int | None = None
 
 
 BevHook = Callable[[int, Any, Float[Array, "q c"], Float[Array, "q c"]], Float[Array, "q c"]]
@@ -143,7 +145,11 @@ class Prior:
 
 @runtime_checkable
 class PriorConfig(Protocol):
-    """The configuration of a prior: a frozen dataclass."""
+    """The configuration of a prior: a frozen dataclass.
+
+    It may have a method `host_limits(host: HostSpec) -> Rules`: what its settings demand of the host, in the form of
+    `limits()`; the host checks it with its own.
+    """
 
     def build(self, host: HostSpec) -> Prior:
         """Return the prior for a host."""

@@ -46,8 +46,13 @@ class PriorsConfig:
 
     def build(self, host: HostSpec) -> dict[str, Prior]:
         """Return the priors that are configured, by name."""
+        return {name: config.build(host) for name, config in self.configured.items()}
+
+    @property
+    def configured(self) -> dict[str, PriorConfig]:
+        """The configurations of those that are not None, by name."""
         configs: dict[str, PriorConfig | None] = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
-        return {name: config.build(host) for name, config in configs.items() if config is not None}
+        return {name: config for name, config in configs.items() if config is not None}
 
 
 def start_memories(priors: Mapping[str, Prior]) -> ByPrior:

@@ -14,45 +14,31 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from tflane_jax.geometry import PerceptionRange
-from tflane_jax.layers.attention import MultiHeadAttention
 from tflane_jax.layers.masks import key_mask, radius_mask
 from tflane_jax.layers.polyline_encoder import PolylineEncoder, PolylineEncoderConfig
-from tflane_jax.layers.precision import Precision, run_part
-from tflane_jax.limits import Count, Positive, Rules, splits
+from tflane_jax.layers.precision import run_part
 from tflane_jax.models.prior import BevCells, HostSpec, Prior
+from tflane_jax.models.token_fusion import TokenFusionConfig, attend_to_tokens
 from tflane_jax.priors.sd_map import SdMapPriorConfig, sd_map_tokens
 from tflane_jax.scene import Example, SdMap
 
 
 @dataclass(frozen=True)
-class SdMapModuleConfig:
+class SdMapModuleConfig(TokenFusionConfig):
     """Sizes of encoder and fusion. The defaults are SMERF's; `SMALL_SD_MAP` trains on two CPU cores.
 
     Attributes:
         prior: coordinates and labels.
         lines: encoder of polylines.
-        heads: of the attention to the tokens.
-        width, norm, radius: see `MarkerFusionConfig`; SMERF's are the defaults.
+        heads, width, norm, radius, precision, remat: see `TokenFusionConfig`; SMERF's are the defaults.
         absent: if no line is valid, "nothing" leaves the BEV features exactly as they are; "reference" adds the bias of
             the attention's output and normalises, as the published code does for an empty map in a batch.
-        precision: dtype of linear layers, see `layers.precision`; parameters, tokens and results are float32.
-        remat: recompute the activations of each layer and of each fusion for the gradient instead of keeping them.
     """
 
     prior: SdMapPriorConfig = SdMapPriorConfig()
     lines: PolylineEncoderConfig = PolylineEncoderConfig()
-    heads: Count = 4
-    width: Count | None = None
     norm: Literal["sum", "query"] = "sum"
-    radius: Positive | None = None
     absent: Literal["nothing", "reference"] = "nothing"
-    precision: Precision = "float32"
-    remat: bool = False
-
-    def limits(self) -> Rules:
-        """Channels of the attention split over heads."""
-        if self.width is not None:
-            yield splits("heads", self.heads, "width", self.width)
 
     def build(self, host: HostSpec) -> SdMapPrior:
         """Return the prior for a host."""
@@ -167,17 +153,16 @@ class SdMapFusion(nn.Module):
 
     def _fuse(self, bev, position, tokens, valid, mask) -> Float[Array, "q c"]:
         """Return the BEV features; called by the compact method."""
-        config, channels, present = self.config, bev.shape[-1], valid.any()
-        norm, added = nn.LayerNorm(epsilon=1e-5, name="norm"), config.norm == "query"
-        attention = MultiHeadAttention(
-            config.width or channels, config.heads, out=channels, zero_init=added, name="attention"
-        )
-        query = norm(bev) if added else bev
-        found = attention(query + position, tokens, tokens, key_mask(valid) if mask is None else mask)
-        if config.absent == "reference":
+        config, present = self.config, valid.any()
+
+        def change(found):
+            if config.absent == "nothing":
+                return found
             # Attention without keys: published code has 0 before the output projection, this one after it.
-            found = jnp.where(present, found, attention.variables["params"]["output"]["bias"][None])
-        fused = bev + found if added else norm(bev + found)
+            return jnp.where(present, found, self.variables["params"]["attention"]["output"]["bias"][None])
+
+        mask = key_mask(valid) if mask is None else mask
+        fused = attend_to_tokens(config, bev, position, tokens, mask, change)
         return fused if config.absent == "reference" else jnp.where(present, fused, bev)
 
 

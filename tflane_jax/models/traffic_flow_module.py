@@ -25,8 +25,8 @@ from tflane_jax.layers.positions import sine_encoding
 from tflane_jax.layers.precision import Precision, run_layer, run_part
 from tflane_jax.limits import DIFFERENT, NOT_EMPTY, Count, CountOrZero, Rules, check_settings, splits
 from tflane_jax.models.prior import BevCells, HostQueries, HostSpec, Prior
+from tflane_jax.models.raster_fusion import RasterFusion, TrafficRasterConfig
 from tflane_jax.models.traffic_masks import TrafficMaskConfig, sees_any, spatial_mask, temporal_mask
-from tflane_jax.models.traffic_raster import TrafficRasterConfig, TrafficRasterFusion
 from tflane_jax.priors.traffic_flow import TrafficFlowPriorConfig, TrafficFlowTokens, select_traffic_flow
 from tflane_jax.priors.traffic_raster import rasterise_traffic_flow
 from tflane_jax.scene import Example, RoadUser, TrafficFlow
@@ -108,6 +108,11 @@ class TrafficFlowConfig:
         somewhere = self.insert != "nowhere" or self.bev is not None
         yield "insert", somewhere, "before_decoder or every_layer where bev is None: else traffic flow enters nowhere"
 
+    def host_limits(self, host: HostSpec) -> Rules:
+        """The channels of a query split over the heads of the module."""
+        if self.insert != "nowhere":
+            yield splits("module.heads", self.module.heads, "the channels of a query", host.dim)
+
     def build(self, host: HostSpec) -> TrafficFlowPrior:
         """Return the prior for a host; raises UserError for settings that break a limit."""
         check_settings(self)
@@ -169,11 +174,12 @@ class TrafficFlowPrior(Prior):
     def into_bev(self, tokens: EncodedTrafficFlow, layer: int, cells: BevCells) -> Float[Array, "q c"]:
         """Return the BEV features with the tracks written into the cells that they pass."""
         config = self.config.bev
-        if config is None or (layer > 0 and config.layers == "first"):
+        if config is None or not config.enters(layer):
             return cells.features
         tracks = jax.tree.map(jnp.asarray, tokens.tracks)
         raster = rasterise_traffic_flow(tracks, self.config.prior.coordinates, cells.grid, config.between)
-        return TrafficRasterFusion(config, name=f"traffic_flow_{layer}")(cells.features, raster)
+        fuse = RasterFusion(config.hidden, name=f"traffic_flow_{layer}")
+        return fuse(cells.features, raster.features, raster.touched)
 
     def into_queries(self, tokens: EncodedTrafficFlow, layer: int, queries: HostQueries) -> Float[Array, "q d"]:
         """Return L'_Feat before the layers selected by `insert`; raise ValueError where `queries.check` does."""

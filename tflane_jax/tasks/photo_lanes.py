@@ -18,6 +18,7 @@ from tflane_jax.datasets.photos import FOCAL, HORIZON, PhotoCamera, Placement, f
 from tflane_jax.evaluation.photo_lanes import Judgement, common_horizon, is_blank, judge_lanes, without_crossings
 from tflane_jax.evaluation.predict import Predictor
 from tflane_jax.files.images import opencv
+from tflane_jax.geometry.cameras import inside_image
 from tflane_jax.geometry.lane_shapes import curve_columns
 from tflane_jax.models.parameters import Params
 from tflane_jax.scene import LaneLines, RoadImage, row_of
@@ -185,8 +186,7 @@ class PhotoReader:
         for i in believed:
             lane = seen.lanes[i]
             points = seen.view.to_photo(lane)
-            u, v = points.T
-            points = points[(u >= 0) & (u < width) & (v >= max(top, 0.0)) & (v < height)]
+            points = points[inside_image(points, width, height) & (points[:, 1] >= top)]
             if len(points) > 1:
                 lanes.append(points)
                 worth.append(float(seen.scores[i]) + judged.paint[i])

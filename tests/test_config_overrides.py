@@ -1,14 +1,16 @@
 """Settings changed by arguments: what they change, and errors that name the setting."""
 
+import argparse
 import dataclasses
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from tflane_jax.config import OpenLaneV2Data, RunConfig
-from tflane_jax.config_io import settings
-from tflane_jax.config_overrides import apply_overrides
+from tflane_jax.commands import train
+from tflane_jax.config import OpenLaneV2Data, RunConfig, epochs_of
+from tflane_jax.config_io import from_json, settings, to_json
+from tflane_jax.config_overrides import apply_overrides, batch_notices
 from tflane_jax.errors import UserError
 from tflane_jax.markers.simulation import MarkerConfig, MarkerSimulationConfig
 from tflane_jax.models.marker_fusion import MarkerFusionConfig
@@ -16,6 +18,9 @@ from tflane_jax.models.priors import PriorsConfig
 from tflane_jax.models.toponet import TopoNetConfig
 from tflane_jax.models.traffic_flow_module import TrafficFlowConfig
 from tflane_jax.tasks.lane_graph import LaneGraphTask
+from tflane_jax.training.loop import TrainingConfig
+from tflane_jax.training.restarts import RestartsConfig
+from tflane_jax.training.schedule import DropsConfig, OptimConfig
 
 FLOW = RunConfig(task=LaneGraphTask(TopoNetConfig(priors=PriorsConfig(traffic_flow=TrafficFlowConfig()))))
 
@@ -102,3 +107,75 @@ def test_invalid_overrides_give_a_one_line_error(arguments, message):
     with pytest.raises(UserError, match=message) as error:
         apply_overrides(FLOW, arguments)
     assert "\n" not in str(error.value)
+
+
+RESNET = RunConfig(
+    training=TrainingConfig(steps=24 * 2810, batch_size=8, eval_every=2810, checkpoint_every=1000),
+    optim=OptimConfig(epoch_steps=2810),
+)
+SAME = "--training.same-examples"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["--training.batch-size", "16"], (24 * 2810, 2810, 1000, 2810)),
+        (["--training.batch-size", "16", SAME], (24 * 1405, 1405, 500, 1405)),
+        (["--training.batch-size", "4", SAME], (48 * 2810, 5620, 2000, 5620)),
+        (["--training.batch-size=64", SAME], (24 * 352, 352, 125, 352)),  # 351.25 updates are a whole epoch
+        ([SAME], (24 * 2810, 2810, 1000, 2810)),
+        (["--training.batch-size", "16", SAME, "--training.steps", "2810"], (2810, 1405, 500, 1405)),
+        (["--training.batch-size", "16", SAME, "--optim.epoch-steps", "1400"], (24 * 1400, 1400, 500, 1400)),
+        (["--training.batch-size", "16", SAME, "--optim.epoch-steps", "0"], (24 * 1405, 1405, 500, 0)),
+    ],
+)
+def test_another_batch_may_keep_the_number_of_examples(arguments, expected):
+    config = apply_overrides(RESNET, arguments)
+    training = config.training
+    assert (training.steps, training.eval_every, training.checkpoint_every, config.optim.epoch_steps) == expected
+    assert training.log_every == RESNET.training.log_every
+    # A saved configuration is what is trained, and may be changed again.
+    assert from_json(RunConfig, to_json(config)) == config
+    assert apply_overrides(config, [SAME]) == replace(config, training=replace(training, same_examples=True))
+
+
+@pytest.mark.parametrize(
+    ("optim", "arguments", "expected"),
+    [
+        (OptimConfig(drops=DropsConfig((4000, 6001))), [], OptimConfig(drops=DropsConfig((2000, 3001)))),
+        (
+            OptimConfig(restarts=RestartsConfig(1001)),
+            ["--optim.restarts.factor", "3"],
+            OptimConfig(restarts=RestartsConfig(501, factor=3.0)),
+        ),
+        (OptimConfig(), ["--optim.restarts", "default"], OptimConfig(restarts=RestartsConfig())),
+        (
+            OptimConfig(restarts=RestartsConfig(1001)),
+            ["--optim.restarts.cycle-steps", "100"],
+            OptimConfig(restarts=RestartsConfig(100)),
+        ),
+    ],
+)
+def test_drops_and_cycles_are_divided_too_unless_they_are_given(optim, arguments, expected):
+    config = apply_overrides(replace(RESNET, optim=optim), ["--training.batch-size", "16", SAME, *arguments])
+    assert config.optim == expected
+
+
+def test_tflane_train_tells_what_another_batch_trains(tmp_path, capsys):
+    options = argparse.Namespace(config="camera/toponet_r50")
+    train._config(options, tmp_path, ["--training.batch-size", "16"])
+    assert "48 epochs in place of 24" in capsys.readouterr().err
+    config = train._config(options, tmp_path, ["--training.batch-size", "16", SAME])
+    assert capsys.readouterr().err == ""
+    assert epochs_of(config) == 24
+
+
+def test_what_another_batch_trains_is_told():
+    changed = apply_overrides(RESNET, ["--training.batch-size", "16"])
+    (notice,) = batch_notices(RESNET, changed)
+    assert "sees 2 times as many examples, 48 epochs in place of 24. --training.same-examples" in notice
+    without = replace(RESNET, optim=OptimConfig())
+    (notice,) = batch_notices(without, apply_overrides(without, ["--training.batch-size", "2"]))
+    assert "sees 0.25 times as many examples. --training.same-examples" in notice
+    for known in ([], ["--training.batch-size", "16", SAME], ["--training.batch-size", "16", "--training.steps", "9"]):
+        assert batch_notices(RESNET, apply_overrides(RESNET, [*known, "--optim.warmup-steps", "3"])) == []

@@ -117,5 +117,6 @@ def test_a_host_has_the_loss_and_the_gradient_of_one_device(forced):
 def test_a_batch_that_cannot_be_shared_evenly_is_refused(forced):
     devices = forced[1]["devices"]
     assert forced[1]["refused"] == (
-        f"training.batch_size is 9, which {devices} devices cannot share evenly: choose a multiple of {devices}"
+        f"training.batch_size is 9, which {devices} devices cannot share evenly: choose a multiple of {devices} "
+        "(--training.same-examples divides the steps as the batch grows)"
     )

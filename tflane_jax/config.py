@@ -11,7 +11,7 @@ import dataclasses
 import difflib
 import re
 import traceback
-from collections.abc import Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
@@ -52,6 +52,7 @@ else:
 
 
 T = TypeVar("T")
+_STEP_COUNTS = ("steps", "eval_every", "checkpoint_every")  # of `TrainingConfig`
 # Configuration files import data classes from here or from their dataset's file.
 __all__ = [
     "EvaluationConfig",
@@ -127,6 +128,59 @@ def with_reference_batch(config: RunConfig, chosen: RunConfig) -> RunConfig:
         return config
     optim = dataclasses.replace(config.optim, reference_batch=chosen.training.batch_size)
     return dataclasses.replace(config, optim=optim)
+
+
+def with_same_examples(config: RunConfig, chosen: RunConfig, given: Collection[str] = ()) -> RunConfig:
+    """Return a configuration that trains on as many examples as the one whose numbers were chosen for its batch.
+
+    With `training.same_examples`, the settings of `with_step_counts` are divided by the ratio of the batch sizes and
+    rounded up; whole epochs (`optim.epoch_steps`) stay whole. `training.log_every` and the warm-up stay. Without it
+    nothing changes.
+
+    Args:
+        config: with the batch size to train with.
+        chosen: the same configuration before its batch size was changed.
+        given: names of settings, or of parts, that stay as they are.
+    """
+    before, after = chosen.training.batch_size, config.training.batch_size
+    if not config.training.same_examples or before == after:
+        return config
+
+    def stays(name: str) -> bool:
+        return any(name == one or name.startswith(f"{one}.") for one in given)
+
+    def divided(number: int) -> int:
+        return -(-number * before // after)
+
+    epoch = chosen.optim.epoch_steps
+    new_epoch = config.optim.epoch_steps if stays("optim.epoch_steps") else divided(epoch)
+
+    def change(name: str, number: int) -> int:
+        if stays(name):
+            return number
+        whole_epochs = epoch > 0 and new_epoch > 0 and number % epoch == 0
+        return number // epoch * new_epoch if whole_epochs else divided(number)
+
+    return with_step_counts(config, change)
+
+
+def with_step_counts(config: RunConfig, change: Callable[[str, int], int]) -> RunConfig:
+    """Return a configuration with other numbers of updates; `change` takes the name of a setting and its value.
+
+    These are `steps`, `eval_every` and `checkpoint_every` of `training`, `epoch_steps`, `drops.steps` and
+    `restarts.cycle_steps` of `optim`. `log_every` and the warm-up are not among them.
+    """
+    training, optim = config.training, config.optim
+    counts = {name: change(f"training.{name}", getattr(training, name)) for name in _STEP_COUNTS}
+    drops, restarts = optim.drops, optim.restarts
+    if drops is not None:
+        drops = dataclasses.replace(drops, steps=tuple(change("optim.drops.steps", step) for step in drops.steps))
+    if restarts is not None:
+        cycle_steps = change("optim.restarts.cycle_steps", restarts.cycle_steps)
+        restarts = dataclasses.replace(restarts, cycle_steps=cycle_steps)
+    epoch_steps = change("optim.epoch_steps", optim.epoch_steps)
+    optim = dataclasses.replace(optim, epoch_steps=epoch_steps, drops=drops, restarts=restarts)
+    return dataclasses.replace(config, training=dataclasses.replace(training, **counts), optim=optim)
 
 
 def load_ablations(name: str) -> dict[str, RunConfig]:

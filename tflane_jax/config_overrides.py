@@ -9,7 +9,7 @@ import io
 import re
 from collections.abc import Sequence
 
-from tflane_jax.config import RunConfig, with_reference_batch
+from tflane_jax.config import RunConfig, with_reference_batch, with_same_examples
 from tflane_jax.config_io import choices, settings, with_setting
 from tflane_jax.errors import UserError
 from tflane_jax.limits import check_settings
@@ -30,7 +30,8 @@ _NO_NUMBER = re.compile(
 def apply_overrides(config: RunConfig, arguments: Sequence[str]) -> RunConfig:
     """Return the configuration with settings changed by `--a.b.c value` arguments, typed by tyro.
 
-    A learning rate that is scaled without `optim.reference_batch` was chosen for the batch of `config`.
+    A learning rate that is scaled without `optim.reference_batch` was chosen for the batch of `config`, and so were
+    the numbers of updates that `training.same_examples` divides where the arguments do not set them.
 
     An argument that chooses an optional part, or the class of a part, is applied first, wherever it appears:
     `--a.b None`, `--a.b default` or `--a.b NameOfItsClass`; the part then has its defaults.
@@ -43,7 +44,7 @@ def apply_overrides(config: RunConfig, arguments: Sequence[str]) -> RunConfig:
         return config
     import tyro
 
-    given = config
+    given, names = config, {_setting(argument) for argument in arguments} - {""}
     config, arguments = _choose_parts(config, arguments)
     _check_names(config, arguments)
     output = io.StringIO()
@@ -52,9 +53,24 @@ def apply_overrides(config: RunConfig, arguments: Sequence[str]) -> RunConfig:
             changed = tyro.cli(RunConfig, default=config, args=list(arguments), config=(tyro.conf.AvoidSubcommands,))
     except SystemExit as error:
         raise UserError(_without_boxes(output.getvalue())) from error
-    changed = with_reference_batch(changed, given)
+    changed = with_same_examples(with_reference_batch(changed, given), given, names)
     check_settings(changed, "--")
     return changed
+
+
+def batch_notices(config: RunConfig, changed: RunConfig) -> list[str]:
+    """Return what to say of overrides that change the batch and leave the number of updates: what is trained then."""
+    before, after, steps = config.training.batch_size, changed.training.batch_size, changed.training.steps
+    if before == after or steps != config.training.steps or changed.training.same_examples:
+        return []
+    epochs = ""
+    if (epoch := config.optim.epoch_steps) > 0:
+        epochs = f", {steps * after / (epoch * before):.4g} epochs in place of {steps / epoch:.4g}"
+    return [
+        f"training.batch_size is {after} in place of {before}, and training.steps is {steps} as before: the run sees "
+        f"{after / before:.4g} times as many examples{epochs}. --training.same-examples keeps their number: it divides "
+        "the settings that count updates (docs/scale.md)"
+    ]
 
 
 def override_names(config: RunConfig) -> list[str]:

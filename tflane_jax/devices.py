@@ -25,6 +25,8 @@ from tflane_jax.errors import UserError
 DATA_AXIS = "data"
 """Axis of the mesh that divides a batch."""
 
+_OTHER_BATCH = " (--training.same-examples divides the steps as the batch grows)"
+
 
 def training_mesh(batch_size: int, accumulate: int = 1) -> Mesh | None:
     """Return the mesh over all devices of all processes; None if there is one device.
@@ -36,12 +38,12 @@ def training_mesh(batch_size: int, accumulate: int = 1) -> Mesh | None:
         shared = "" if devices == 1 else f" times {devices} devices"
         raise UserError(
             f"training.batch_size is {batch_size}, which {accumulate} parts (training.accumulate){shared} cannot share "
-            f"evenly: choose a multiple of {devices * accumulate}"
+            f"evenly: choose a multiple of {devices * accumulate}{_OTHER_BATCH}"
         )
     if batch_size % devices:
         raise UserError(
             f"training.batch_size is {batch_size}, which {devices} devices cannot share evenly: "
-            f"choose a multiple of {devices}"
+            f"choose a multiple of {devices}{_OTHER_BATCH}"
         )
     return prediction_mesh(batch_size)
 

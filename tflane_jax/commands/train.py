@@ -15,7 +15,7 @@ from tflane_jax import processes
 from tflane_jax.config import RunConfig, load_config
 from tflane_jax.config_files import split_reference
 from tflane_jax.config_io import from_json, to_json, to_text
-from tflane_jax.config_overrides import apply_overrides
+from tflane_jax.config_overrides import apply_overrides, batch_notices
 from tflane_jax.errors import UserError
 from tflane_jax.runs import resumable_config, train_run
 from tflane_jax.startup import write
@@ -75,7 +75,11 @@ def _trained(options: argparse.Namespace, overrides: Sequence[str]) -> int:
 def _config(options: argparse.Namespace, out: Path, overrides: Sequence[str]) -> RunConfig:
     if options.config is not None:
         with processes.agreed():
-            return apply_overrides(load_config(options.config), overrides)
+            config = load_config(options.config)
+            changed = apply_overrides(config, overrides)
+        for notice in batch_notices(config, changed) if processes.is_first() else ():
+            write(notice)
+        return changed
     if overrides:
         raise UserError(
             f"a run is resumed with its own configuration: leave {overrides[0]} out (to train longer, or with "

@@ -53,6 +53,8 @@ class TrainingConfig:
     Attributes:
         steps: updates.
         batch_size: examples of an update (of each seed), on all devices together.
+        same_examples: whether an override of `batch_size` divides what counts updates by the ratio of the batches, see
+            `config.with_same_examples`; the resolved configuration has the numbers that result.
         accumulate: parts in which a batch passes through the model, one after the other, to save memory; see
             docs/scale.md for what is equal to one pass. `batch_size` must be a multiple of it times the devices.
         shard_state: whether several devices share parameters, their average and moments, each with a part of them, in
@@ -71,6 +73,7 @@ class TrainingConfig:
 
     steps: Count = 10_000
     batch_size: Count = 8
+    same_examples: bool = False
     accumulate: Count = 1
     shard_state: bool = False
     seeds: Annotated[tuple[CountOrZero, ...], NOT_EMPTY, DIFFERENT] = (0,)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from tflane_jax.ablations.declaration import Claim, Declaration
-from tflane_jax.config import RunConfig, load_config
+from tflane_jax.config import RunConfig, load_config, with_step_counts
 from tflane_jax.config_overrides import apply_overrides
 
 
@@ -163,15 +163,8 @@ def longer(config: RunConfig, factor: int) -> RunConfig:
 
     Its learning rate falls as much more slowly; the warm-up and the number of evaluations stay.
     """
-    training, optim = config.training, config.optim
-    training = replace(training, steps=factor * training.steps, eval_every=factor * training.eval_every)
-    drops, restarts = optim.drops, optim.restarts
-    if drops is not None:
-        drops = replace(drops, steps=tuple(factor * step for step in drops.steps))
-    if restarts is not None:
-        restarts = replace(restarts, cycle_steps=factor * restarts.cycle_steps)
-    optim = replace(optim, epoch_steps=factor * optim.epoch_steps, drops=drops, restarts=restarts)
-    return replace(config, training=training, optim=optim)
+    kept = "training.checkpoint_every"
+    return with_step_counts(config, lambda name, number: number if name == kept else factor * number)
 
 
 def shortened(config: RunConfig) -> RunConfig:

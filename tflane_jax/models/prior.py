@@ -86,6 +86,13 @@ class HostQueries(NamedTuple):
     mask: Bool[Array, "q q"] | None = None
     groups: tuple[int, ...] = ()
 
+    def check(self, host: HostSpec) -> None:
+        """Raise ValueError for queries, or position encodings, of other channels than the host's."""
+        for name, found in (("features", self.features), ("position", self.position)):
+            if found.ndim != 2 or found.shape[1] != host.dim:
+                shape, wanted = tuple(found.shape), f"(Q, HostSpec.dim) = (Q, {host.dim})"
+                raise ValueError(f"{name} of the queries have shape {shape}, expected {wanted}")
+
 
 class Prior:
     """A prior in one host; subclasses override the methods that they use.

@@ -176,19 +176,11 @@ class TrafficFlowPrior(Prior):
         return TrafficRasterFusion(config, name=f"traffic_flow_{layer}")(cells.features, raster)
 
     def into_queries(self, tokens: EncodedTrafficFlow, layer: int, queries: HostQueries) -> Float[Array, "q d"]:
-        """Return L'_Feat before the layers selected by `insert`.
-
-        Raises:
-            ValueError: queries or their positions have other channels than `HostSpec.dim`.
-        """
+        """Return L'_Feat before the layers selected by `insert`; raises ValueError as `HostQueries.check` does."""
         if tokens.features is None or (layer > 0 and self.config.insert == "before_decoder"):
             return queries.features
         config = self.config
-        for name, found in (("features", queries.features), ("position", queries.position)):
-            if found.ndim != 2 or found.shape[1] != self.host.dim:
-                raise ValueError(
-                    f"{name} of the queries have shape {found.shape}, expected (Q, HostSpec.dim) = (Q, {self.host.dim})"
-                )
+        queries.check(self.host)
         mask = spatial_mask(
             config.module.masking, queries, tokens.tracks, config.prior.coordinates, self.host.bev_range
         )

@@ -88,13 +88,12 @@ class HostQueries(NamedTuple):
     mask: Bool[Array, "q q"] | None = None
     groups: tuple[int, ...] = ()
 
-    def check(self, dim: int) -> None:
-        """Raise ValueError unless features and positions have `dim` channels, those of `HostSpec`."""
+    def check(self, host: HostSpec) -> None:
+        """Raise ValueError for queries, or position encodings, of other channels than the host's."""
         for name, found in (("features", self.features), ("position", self.position)):
-            if found.ndim != 2 or found.shape[1] != dim:
-                raise ValueError(
-                    f"{name} of the queries have shape {found.shape}, expected (Q, HostSpec.dim) = (Q, {dim})"
-                )
+            if found.ndim != 2 or found.shape[1] != host.dim:
+                shape, wanted = tuple(found.shape), f"(Q, HostSpec.dim) = (Q, {host.dim})"
+                raise ValueError(f"{name} of the queries have shape {shape}, expected {wanted}")
 
 
 class Prior:

@@ -182,11 +182,11 @@ class TrafficFlowPrior(Prior):
         return fuse(cells.features, raster.features, raster.touched)
 
     def into_queries(self, tokens: EncodedTrafficFlow, layer: int, queries: HostQueries) -> Float[Array, "q d"]:
-        """Return L'_Feat before the layers selected by `insert`; raise ValueError where `queries.check` does."""
+        """Return L'_Feat before the layers selected by `insert`; raises ValueError as `HostQueries.check` does."""
         if tokens.features is None or (layer > 0 and self.config.insert == "before_decoder"):
             return queries.features
         config = self.config
-        queries.check(self.host.dim)
+        queries.check(self.host)
         mask = spatial_mask(
             config.module.masking, queries, tokens.tracks, config.prior.coordinates, self.host.bev_range
         )

@@ -190,7 +190,7 @@ def test_every_kind_of_setting_survives_json(value):
         ({"rate": "fast"}, "setting rate cannot be 'fast'"),
         ({"rate": True}, "setting rate cannot be True"),
         ({"speed": 3}, "setting speed is unknown"),
-        ({"part": {"class": "os.system", "size": 1}}, r"class os\.system \(setting part\) is not part of tflane_jax"),
+        ({"part": {"class": "os.system", "size": 1}}, r"class os\.system \(setting part\) is not part of this version"),
         ({"part": {"class": "Other", "size": 1.5}}, r"setting part\.size cannot be 1\.5"),
         ({"part": {"class": "Inner", "pairs": [["BLUE", 1.0]]}}, r"setting part\.pairs cannot be 'BLUE'"),
         ({"class": "Inner"}, "should be a Outer"),

@@ -182,7 +182,7 @@ def _check_known(content: dict[str, Any], name: str) -> None:
     if not isinstance(kind, str) or any(kind in vars(module) for module in list(sys.modules.values())):
         return
     raise UserError(
-        f"class {kind} (setting {name}) is not part of tflane_jax: import its module first "
+        f"class {kind} (setting {name}) is not part of this version of tflane_jax: if it is yours, import its module "
         f"(--import MODULE or {VARIABLE})"
     )
 

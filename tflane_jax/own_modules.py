@@ -7,6 +7,7 @@ found by `sys.path`, which they inherit, and files by TFLANE_FILES.
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import hashlib
 import importlib
 import importlib.abc
@@ -14,7 +15,7 @@ import importlib.machinery
 import importlib.util
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -91,6 +92,31 @@ def import_file(path: Path, *, beside: bool = True) -> ModuleType:
     if beside:
         look_in(path.parent)
     return importlib.import_module(_module_name(path))
+
+
+def imports_of(config: Any) -> str:
+    """Return the options, " --import MODULE ...", that a command needs to read a configuration; "" for none.
+
+    Args:
+        config: a dataclass, whose settings may be dataclasses of the user.
+    """
+    found: dict[str, None] = {}
+    for kind in _classes(config):
+        if kind.__module__.partition(".")[0] != __name__.partition(".")[0]:
+            module = sys.modules[kind.__module__]
+            own_file = kind.__module__.startswith(_PREFIX)
+            found[os.path.relpath(str(module.__file__)) if own_file else kind.__module__] = None
+    return "".join(f" --import {name}" for name in found)
+
+
+def _classes(config: Any) -> Iterator[type]:
+    if dataclasses.is_dataclass(config):
+        yield type(config)
+        for field in dataclasses.fields(config):
+            yield from _classes(getattr(config, field.name))
+    elif isinstance(config, tuple):
+        for one in config:
+            yield from _classes(one)
 
 
 def _named() -> list[str]:

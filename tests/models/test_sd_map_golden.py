@@ -72,7 +72,7 @@ def encoder_config(case):
     lines = PolylineEncoderConfig(
         found.dim, found.layers, found.heads, found.hidden, 0.0, found.num_feats or 0, float(found.temperature)
     )
-    return SdMapModuleConfig(SdMapPriorConfig(categories=categories), lines), limits
+    return SdMapModuleConfig(prior=SdMapPriorConfig(categories=categories), lines=lines), limits
 
 
 @pytest.mark.parametrize("path", golden_modules("smerf_map_graph_transformer*"), ids=case_id)

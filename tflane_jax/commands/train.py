@@ -17,6 +17,7 @@ from tflane_jax.config_files import split_reference
 from tflane_jax.config_io import from_json, to_json, to_text
 from tflane_jax.config_overrides import apply_overrides, batch_notices
 from tflane_jax.errors import UserError
+from tflane_jax.own_modules import imports_of
 from tflane_jax.runs import resumable_config, train_run
 from tflane_jax.startup import write
 from tflane_jax.training.runtime import configure_jax
@@ -44,21 +45,19 @@ def _trained(options: argparse.Namespace, overrides: Sequence[str]) -> int:
     out = options.out or _default_folder(options.config)
     config = _config(options, out, overrides)
     _print_devices()
-    before = _saved_at(out)
+    before, own = _saved_at(out), imports_of(config)
+    resume = f"go on with: tflane train --resume --out {out}{own}"
     try:
         result = train_run(config, out, start=options.start)
     except KeyboardInterrupt as error:
         number = getattr(error, "number", signal.SIGINT)
         began = options.start == "resume" or _saved_at(out) != before
-        remedy = f"; go on with: tflane train --resume --out {out}" if began else _NOT_BEGUN
+        remedy = f"; {resume}" if began else _NOT_BEGUN
         print(f"stopped by {signal.Signals(number).name}{remedy}", file=sys.stderr)
         return 128 + number
     if result.stopped_by is not None:
         name = signal.Signals(result.stopped_by).name
-        print(
-            f"stopped by {name} after step {result.step}; go on with: tflane train --resume --out {out}",
-            file=sys.stderr,
-        )
+        print(f"stopped by {name} after step {result.step}; {resume}", file=sys.stderr)
         return 128 + result.stopped_by
     if not processes.is_first():
         return 0
@@ -68,7 +67,7 @@ def _trained(options: argparse.Namespace, overrides: Sequence[str]) -> int:
     for name, value in result.metrics.items():
         if "@" not in name:  # scores at single thresholds are in metrics.jsonl only
             print(f"  {name} = {value:.4f}")
-    print(f"evaluate with: tflane eval {out}")
+    print(f"evaluate with: tflane eval {out}{own}")
     return 0
 
 

@@ -4,6 +4,7 @@ import atexit
 import gc
 import os
 import shutil
+import sys
 import tempfile
 
 from tests.fast_compile import compile_fast
@@ -11,6 +12,7 @@ from tests.fast_compile import compile_fast
 compile_fast()
 
 import jax  # noqa: E402
+import pytest  # noqa: E402
 from hypothesis import settings  # noqa: E402
 
 from tflane_jax.training.runtime import configure_jax  # noqa: E402
@@ -34,6 +36,14 @@ gc.set_threshold(100_000, 50, 100)
 # Every run draws the same examples, on machines of any speed; files say how many.
 settings.register_profile("repeatable", derandomize=True, deadline=None)
 settings.load_profile("repeatable")
+
+
+@pytest.fixture(autouse=True)
+def _search_path():
+    """Forget the folders of configuration files that a test loaded, in which later tests would find modules."""
+    before = list(sys.path)
+    yield
+    sys.path[:] = before
 
 
 def pytest_collection_modifyitems(items):

@@ -53,9 +53,9 @@ def apart(monkeypatch, tmp_path):
     before = set(sys.modules)
     for name in (own_modules.VARIABLE, own_modules._FILES):
         monkeypatch.setenv(name, "")
-    work = tmp_path / "work"
-    work.mkdir()
-    monkeypatch.chdir(work)
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    monkeypatch.chdir(folder)
     monkeypatch.setattr(sys, "path", [path for path in sys.path if path])
     yield
     for name in set(sys.modules) - before:
@@ -164,7 +164,7 @@ def test_a_class_inside_a_config_file_is_one_class():
     path = Path("inside.py")
     path.write_text(LOSS.format(name="OneLossConfig") + CONFIG.format(name="OneLossConfig"))
     config = load_config("inside.py")
-    assert load_config("../work/inside.py") == config
+    assert load_config("../folder/inside.py") == config
     changed = apply_overrides(config, ["--task.losses.smooth-weight", "0.25"])
     assert smooth_weight(changed) == 0.25
     with pytest.raises(UserError, match=r"smooth_weight is -1\.0: it must be"):

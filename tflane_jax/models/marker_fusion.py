@@ -260,6 +260,7 @@ class MarkerFusion(nn.Module):
     def _fuse(self, bev, position, tokens, mask, gate) -> Float[Array, "q c"]:
         """Return Eq. (3); called by the compact method."""
         config, place = self.config, position if self.config.query_position else None
+        # Eq. (3): F' = LayerNorm(F + c Attn(F, M, M)), with c = `gate`.
         fused = attend_to_tokens(config, bev, place, tokens, mask, change=lambda found: gate * found)
         return fused if config.norm == "written" else jnp.where(mask.any(), fused, bev)
 

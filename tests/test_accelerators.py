@@ -102,7 +102,7 @@ def test_a_process_that_is_given_its_place_ignores_the_cluster(joined):
     assert (joined["devices"], joined["cluster_detection_method"]) == (None, "deactivate")
 
 
-SHARED = {"XLA_CLIENT_MEM_FRACTION": "0.450", "TF_CUDA_PLATFORM_GPU_DEVICE_SCHEDULE": "blocking_sync"}
+SHARED = {"XLA_CLIENT_MEM_FRACTION": "0.450"}
 
 
 @pytest.mark.parametrize(
@@ -117,7 +117,7 @@ SHARED = {"XLA_CLIENT_MEM_FRACTION": "0.450", "TF_CUDA_PLATFORM_GPU_DEVICE_SCHED
 )
 def test_workers_take_gpus_in_turn_and_share_their_memory(visible, parallel, expected, monkeypatch):
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
-    for name in (*accelerators._FRACTIONS, "TF_CUDA_PLATFORM_GPU_DEVICE_SCHEDULE"):
+    for name in accelerators._FRACTIONS:
         monkeypatch.delenv(name, raising=False)
     assert [of_worker(slot, parallel) for slot in range(parallel)] == expected
 
@@ -129,11 +129,9 @@ def test_gpus_are_found_without_a_variable_and_a_chosen_fraction_stays(tmp_path,
     for name in ("nvidia4", "nvidia6", "nvidiactl"):
         (tmp_path / name).touch()
     assert gpus() == ["0", "1"]  # CUDA numbers those that it sees
-    waiting = "TF_CUDA_PLATFORM_GPU_DEVICE_SCHEDULE"
-    monkeypatch.setenv(waiting, "spin")
     for name in accelerators._FRACTIONS:  # where both are set, JAX computes on the CPU
         monkeypatch.setenv(name, "0.2")
-        assert of_worker(2, 3) == {"CUDA_VISIBLE_DEVICES": "0", waiting: "spin"}
+        assert of_worker(2, 3) == {"CUDA_VISIBLE_DEVICES": "0"}
         monkeypatch.delenv(name)
 
 

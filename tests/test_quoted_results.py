@@ -11,14 +11,27 @@ import pytest
 
 from tests.shared import ROOT
 
-PAGES = ("README.md", "docs/tf_lane.md", "docs/markers.md", "docs/small_models.md", "docs/real_roads.md")
+PAGES = (
+    "README.md",
+    "docs/tf_lane.md",
+    "docs/markers.md",
+    "docs/small_models.md",
+    "docs/real_roads.md",
+    "docs/gtn_lane.md",
+)
 # The least count of numbers in sentences that must be those of findings; docs/real_roads.md quotes others in brackets.
-FINDINGS = {"README.md": 7, "docs/tf_lane.md": 30, "docs/markers.md": 12, "docs/small_models.md": 0}
+FINDINGS = {
+    "README.md": 7,
+    "docs/tf_lane.md": 30,
+    "docs/markers.md": 12,
+    "docs/small_models.md": 0,
+    "docs/gtn_lane.md": 12,
+}
 COLUMNS = {
     "DET_l": "all/DET_l",
     "TOP_ll": "all/TOP_ll",
     "recall": "all/recall",
-    **{name: f"all/{name}" for name in ("mAP", "AP_ls", "AP_ped", "TOP_lsls")},
+    **{name: f"all/{name}" for name in ("mAP", "AP_ls", "AP_ped", "TOP_lsls", "Accuracy", "FP", "FN")},
     "hidden, driven along": "hidden+traffic/recall",
     "recall, hidden lanes that vehicles drove along": "hidden+traffic/recall",
     "hidden, no vehicle near": "hidden-traffic/recall",
@@ -99,7 +112,7 @@ def wrong_tables(text, recorded):
             for column, cell in zip(header[1:], cells, strict=True):
                 count += 1
                 columns = LINE_COLUMNS if "lines/mAP" in found[name] else COLUMNS
-                if cell != (there := found[name].get(columns.get(column, column))):
+                if cell != (there := str(found[name].get(columns.get(column, column)))):
                     wrong.append(f"{named[1]}, {name}, {column}: {cell} is quoted, {there} recorded")
     return wrong, count
 

@@ -19,7 +19,6 @@ _SHARED_FRACTION = 0.9
 _NO_GPU = ("-1", "NoDevFiles")  # CUDA sees no GPU from such a name on
 _PLUGINS = ("jax_cuda13_plugin", "jax_cuda12_plugin")
 _TRITON = "--xla_gpu_enable_triton_gemm"
-_WAITING = "TF_CUDA_PLATFORM_GPU_DEVICE_SCHEDULE"  # XLA's, in spite of its name
 
 
 def devices_of_task(environment: Mapping[str, str]) -> list[int] | None:
@@ -81,8 +80,8 @@ def gpus() -> list[str]:
 def of_worker(slot: int, parallel: int) -> dict[str, str]:
     """Return environment variables that give one GPU to one of `parallel` processes that train side by side.
 
-    Processes that share a GPU divide its memory, and sleep while they wait for it. Without GPUs there are no variables.
-    The process sets them before JAX looks for its devices.
+    Processes that share a GPU divide its memory. Without GPUs there are no variables. The process sets them before JAX
+    looks for its devices.
     """
     if not (names := gpus()):
         return {}
@@ -92,8 +91,6 @@ def of_worker(slot: int, parallel: int) -> dict[str, str]:
     # JAX computes on the CPU, with no more than a logged error, where both names are set.
     if not any(name in os.environ for name in _FRACTIONS):
         found[_FRACTIONS[0]] = f"{_SHARED_FRACTION / sharing:.3f}"
-    # CUDA may choose to ask the GPU without pause, on the core that augments images (its effect was not measured).
-    found[_WAITING] = os.environ.get(_WAITING, "blocking_sync")
     return found
 
 

@@ -5,9 +5,9 @@
     tflane train --config gtn_lane/table1:gtn_restarts
 
 Networks and data are those of `transformer.py`, `gtn.py`, `gcn.py` and `han.py`, whose 4,000 steps end before every run
-has left its first plateau. 10,000 steps are meant to last until validation is flat (not run yet). So that more steps
-take no longer, the backbone's last stage has one block of 64 channels instead of two of 128: those are a quarter of a
-step. Every row has the same backbone.
+has left its first plateau. After 10,000 steps validation is flat (docs/gtn_lane.md). So that more steps take no longer,
+the backbone's last stage has one block of 64 channels instead of two of 128: those are a quarter of a step. Every row
+has the same backbone.
 
 An ablation NAME has one cosine over the run; `NAME_restarts` has the paper's Eq. (2) instead: three cycles, each twice
 as long as the one before, where none is extended; an extension of the first leaves room for two. The adaptive rule

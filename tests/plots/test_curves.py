@@ -85,6 +85,13 @@ def test_a_model_has_one_colour_in_all_panels(tmp_path, figures):
     assert legend.get_window_extent().y1 <= second.get_window_extent().y0
 
 
+def test_more_models_than_colours_are_told_apart_by_their_lines(tmp_path, figures):
+    records = {f"model {i}": [[{"split": "val", "step": 5, "all/recall": 0.5}]] for i in range(11)}
+    save_comparison_curves(tmp_path / "curves.png", records, ["all/recall"])
+    lines = figures[0].axes[0].lines
+    assert len({(line.get_color(), line.get_linestyle()) for line in lines}) == 11
+
+
 @pytest.mark.parametrize("records", [RECORDS[:1], [{"step": 1, "a": float("nan")}]])
 def test_a_single_record_is_drawn(tmp_path, records):
     assert save_curves(tmp_path / "curves.png", records).stat().st_size > 2000

@@ -21,14 +21,31 @@ def test_lanes_are_drawn_into_a_copy_of_a_frame():
     np.testing.assert_array_equal(lanes_drawn(frame, []), frame)
 
 
-def test_a_lane_whose_ends_changed_places_is_not_drawn():
-    """The metric finds no point on it. Columns are constant: n' alone differs from 0."""
-    curves = np.zeros((3, 8))
-    curves[:, :2], curves[:, 5] = [[0.4, 0.9], [0.9, 0.4], [0.5, 0.8]], [0.7, 0.5, 0.2]
-    logits = np.tile([0.0, 1.0], (3, 1))
-    found = predicted_lines(CurvePrediction(logits=logits, curves=curves))
-    np.testing.assert_allclose(found[:, 0], [[0.2, 0.5], [0.7, 0.4]])
-    np.testing.assert_allclose(found[:, -1], [[0.2, 0.8], [0.7, 0.9]])
+def drawn(*curves):
+    """Return what is drawn of curves (upper, lower, k'', f'', m'', n', b'', b''') that are all lanes."""
+    logits = np.tile([0.0, 1.0], (len(curves), 1))
+    return predicted_lines(CurvePrediction(logits=logits, curves=np.array(curves)))
+
+
+def test_lanes_are_drawn_on_the_rows_of_the_metric():
+    """Columns are constant: n' alone differs from 0. The last lane's ends changed places: the metric reads none."""
+    first, second, swapped = drawn(
+        (0.5, 0.8, 0, 0, 0, 0.2, 0, 0), (0.4, 0.9, 0, 0, 0, 0.7, 0, 0), (0.9, 0.4, 0, 0, 0, 0.8, 0, 0)
+    )
+    for lane, u, rows in ((first, 0.2, range(360, 577, 10)), (second, 0.7, range(290, 649, 10))):
+        seen = lane[~np.isnan(lane[:, 0])]
+        np.testing.assert_allclose(seen, [[u, row / 720.0] for row in rows])
+    assert np.isnan(swapped).all()
+
+
+def test_a_lane_that_ends_above_its_own_horizon_is_not_drawn_across_the_image():
+    """u = 0.5 + 0.001 / (v - 0.4): at its horizon, row 288, it leaves on the right and comes back from the left."""
+    (lane,) = drawn((0.35, 0.9, 0, 0.4, 0.001, 0.5, 0, 0))
+    seen = lane[~np.isnan(lane[:, 0])]
+    assert len(seen) > 35
+    assert np.abs(seen[:, 0] - 0.5).max() < 0.4
+    dense = np.linspace(0.35, 0.9, 100)  # points between the rows of the metric
+    assert np.abs(0.001 / (dense - 0.4)).max() > 0.4
 
 
 SIZES = [((900, 1600), 630), ((1600, 900), 1910), ((2000, 1), 2145), ((1, 900), 34)]

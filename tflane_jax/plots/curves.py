@@ -45,8 +45,7 @@ def save_curves(path: Path, records: Iterable[Mapping[str, Any]]) -> Path:
     for ax, ((split, group), names) in zip(axes.flat, groups.items(), strict=False):
         ax.set_title(f"{split}: {group}" if split else group, fontsize=9, loc="left")
         found = {name.removeprefix(f"{group}/"): series[split, name] for name in names}
-        colours = {name: f"C{number % 10}" for number, name in enumerate(found)}
-        _draw_panel(ax, found, colours, log=split == "train")
+        _draw_panel(ax, found, _styles(found), log=split == "train")
         if list(found) != [group]:
             # Beside the panel, because there are curves everywhere in it.
             ax.legend(fontsize=7, frameon=False, loc="upper left", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.0)
@@ -77,10 +76,10 @@ def save_comparison_curves(
         return None
     columns = min(3, len(panels))
     figure, axes = new_figure(-(-len(panels) // columns), columns, panel=(4.6, 3.2), footer=0.1 + 0.1 * len(found))
-    colours = {model: f"C{number % 10}" for number, model in enumerate(found)}  # the same in all panels
+    styles = _styles(found)  # the same in all panels
     for ax, (name, series) in zip(axes.flat, panels.items(), strict=False):
         ax.set_title(f"validation: {name}", fontsize=9, loc="left")
-        _draw_panel(ax, series, colours)
+        _draw_panel(ax, series, styles)
     hide_unused(axes, len(panels))
     shown = {line.get_label(): line for ax in axes.flat for line in ax.lines}
     figure.legend(
@@ -109,15 +108,24 @@ def curves(records: Iterable[Mapping[str, Any]]) -> dict[tuple[str, str], Series
     }
 
 
-def _draw_panel(ax: Axes, series: Mapping[str, Series], colours: Mapping[str, str], *, log: bool = False) -> None:
+def _styles(names: Iterable[str]) -> dict[str, dict[str, str]]:
+    """Return a colour and a line style for each curve; matplotlib's ten colours come again with other lines."""
+    return {
+        name: {"color": f"C{number % 10}", "linestyle": ("-", "--", ":")[number // 10 % 3]}
+        for number, name in enumerate(names)
+    }
+
+
+def _draw_panel(
+    ax: Axes, series: Mapping[str, Series], styles: Mapping[str, Mapping[str, str]], *, log: bool = False
+) -> None:
     from matplotlib.ticker import MaxNLocator
 
     for name, (steps, values) in series.items():
-        colour = colours[name]
         # A single point needs a marker to be visible.
-        ax.plot(steps, values.mean(1), color=colour, lw=1.4, label=name, marker="o" if len(steps) == 1 else "")
+        ax.plot(steps, values.mean(1), **styles[name], lw=1.4, label=name, marker="o" if len(steps) == 1 else "")
         if values.shape[1] > 1:
-            ax.fill_between(steps, values.min(1), values.max(1), color=colour, alpha=0.2, lw=0)
+            ax.fill_between(steps, values.min(1), values.max(1), color=styles[name]["color"], alpha=0.2, lw=0)
     seen = np.concatenate([values.reshape(-1) for _, values in series.values()])
     seen = seen[np.isfinite(seen)]
     if log and len(seen) and seen.min() > 0.0 and seen.max() > 30.0 * seen.min():

@@ -12,6 +12,7 @@ from jaxtyping import Float, UInt8
 
 from tflane_jax.evaluation.lane_shapes import left_to_right
 from tflane_jax.files.images import opencv
+from tflane_jax.files.tusimple import ROWS, SIZE
 from tflane_jax.geometry.lane_shapes import curve_columns
 from tflane_jax.plots.figure import hide_unused, new_figure, save_figure
 from tflane_jax.scene import CurvePrediction, LaneLines, RoadImage, row_of
@@ -22,7 +23,6 @@ if TYPE_CHECKING:
 # Distinct colours for neighbouring lanes, all visible on asphalt.
 LANE_COLOURS = ("#ff4d6d", "#ffd166", "#4dd2ff", "#7ae582", "#c792ea", "#ff9d3c", "#f5f5f5")
 TRUTH = "#8be28b"
-_POINTS = 100
 # Images in a row of a sheet without predictions.
 _COLUMNS = 4
 _TALLEST = 19.2  # inches of the picture of one photo; portraits of a phone need 17
@@ -99,16 +99,19 @@ def lanes_drawn(
 def predicted_lines(prediction: CurvePrediction, threshold: float | None = None) -> Float[np.ndarray, "l p 2"]:
     """Return (u, v) of the detected lanes, left to right at their lower ends, as fractions of the image.
 
-    A lane whose upper end is below its lower one is left out: the metric finds no point on it either.
+    The points are those that TuSimple's metric reads, on its rows, between the ends of a lane; NaN elsewhere and
+    outside the image. Between two rows a curve that ends above its own horizon f'' leaves the image and comes back from
+    the other side: nobody scores that.
 
     Args:
         prediction: one example, one layer.
         threshold: see `lane_shapes.detected`.
     """
     curves = np.asarray(prediction.curves, np.float64)[left_to_right(prediction, threshold)]
-    curves = curves[curves[:, 0] < curves[:, 1]]
-    rows = np.linspace(curves[:, 0], curves[:, 1], _POINTS, axis=-1)
-    return np.stack([curve_columns(curves[:, 2:], rows), rows], -1)
+    rows = np.broadcast_to(ROWS / SIZE[0], (len(curves), len(ROWS)))
+    columns = curve_columns(curves[:, 2:], rows)
+    read = (rows >= curves[:, :1]) & (rows <= curves[:, 1:2]) & (columns >= 0.0) & (columns <= 1.0)
+    return np.where(read[..., None], np.stack([columns, rows], -1), np.nan)
 
 
 def draw_image(ax: Axes, image: UInt8[np.ndarray, "h w 3"], title: str = "") -> None:

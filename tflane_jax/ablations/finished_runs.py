@@ -12,6 +12,7 @@ from tflane_jax.ablations.results import Results
 from tflane_jax.ablations.scores import CHECKPOINTS, OWN_TEST, measure, with_test_set
 from tflane_jax.ablations.workers import noted, train_all
 from tflane_jax.config import RunConfig
+from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import write_json
 from tflane_jax.progress import progress_bar
 from tflane_jax.runs import load_test_data, open_run
@@ -33,8 +34,14 @@ def train_and_evaluate(
     Returns:
         The runs that were trained and evaluated, and the failures of the others.
     """
-    failures = train_all(order, jobs, cores)
-    failures += evaluate_runs(without_failures(plan, failures), results)
+    return evaluate_others(plan, train_all(order, jobs, cores), results)
+
+
+def evaluate_others(
+    plan: Mapping[str, Sequence[Job]], failures: Sequence[Failure], results: Results
+) -> tuple[dict[str, list[Job]], list[Failure]]:
+    """Add the scores of all runs but those that failed, and why these did, to the results; return both."""
+    failures = [*failures, *evaluate_runs(without_failures(plan, failures), results)]
     results.failed.update(reasons(plan, failures))
     return without_failures(plan, failures), failures
 
@@ -70,12 +77,19 @@ def evaluate_runs(trained: Mapping[str, Sequence[Job]], results: Results) -> lis
 
 
 def first_models(trained: Mapping[str, Sequence[Job]], results: Results) -> dict[str, Model]:
-    """Return the model of each row's first seed at its last checkpoint; no recorded run whose folder is not at hand."""
+    """Return the model of each row's first seed at its last checkpoint, for pictures.
+
+    A recorded run whose folder is not at hand is left out; one whose parameters cannot be read, with a line.
+    """
     models = {}
     for name, done in trained.items():
         job = next((job for job in done if job.recorded is None or job.is_at_hand()), None)
         if results.has(name) and job is not None:
-            run = open_run(job.folder, "last")
+            try:
+                run = open_run(job.folder, "last")
+            except UserError as error:
+                print(f"{name} is not drawn: {error}")
+                continue
             models[name] = Model(run.config.task, run.params[0])
     return models
 

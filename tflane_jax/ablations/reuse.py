@@ -69,7 +69,9 @@ def thread_settings(archive: Archive, own: Mapping[str, Any]) -> list[Mapping[st
     return found
 
 
-def with_recorded(plans: Sequence[Plan], archive: Archive, scores: Collection[str]) -> dict[str, list[Job]]:
+def with_recorded(
+    plans: Sequence[Plan], archive: Archive, scores: Collection[str], *, finished: bool = False
+) -> dict[str, list[Job]]:
     """Return the first plan with recorded runs in the place of trainings.
 
     Recorded runs of another device than that of this process are taken only if no training and no run of a third
@@ -79,6 +81,8 @@ def with_recorded(plans: Sequence[Plan], archive: Archive, scores: Collection[st
         plans: the same trainings with different thread settings, that of this process first.
         archive: what is recorded.
         scores: that a table cannot do without; a run that lacks one is trained.
+        finished: nothing is going to be trained, so that complete runs of any thread setting are taken; of several
+            devices, those of the one with the most.
     """
 
     def best(same: Sequence[Job]) -> Job:
@@ -89,18 +93,23 @@ def with_recorded(plans: Sequence[Plan], archive: Archive, scores: Collection[st
                     yield replace(job, recorded=run)
 
         # A run at hand can be measured for this table; what another one recorded has the parts by scene of its scores.
-        at_hand = same[:1] if same[0].is_complete() else ()
+        at_hand = (job for job in (same if finished else same[:1]) if job.is_complete())
         return next(itertools.chain(recorded(archive.runs), at_hand, recorded(archive.shared), same))
 
-    own = _device(next(iter(plans[0].values()))[0])
-    for allowed in (plans, [plan for plan in plans if _device(next(iter(plan.values()))[0]) == own]):
-        found = {
+    def chosen(allowed: Sequence[Plan]) -> dict[str, list[Job]]:
+        return {
             name: [best([plan[name][i] for plan in allowed]) for i in range(len(jobs))]
             for name, jobs in plans[0].items()
         }
-        if len({_device(job) for jobs in found.values() for job in jobs}) == 1:
-            break
-    return found
+
+    by_device: dict[Any, list[Plan]] = {}
+    for plan in plans:
+        by_device.setdefault(_device(next(iter(plan.values()))[0]), []).append(plan)
+    of_each = (chosen(same) for same in by_device.values())  # that of this process first
+    if finished:
+        return max(of_each, key=lambda found: sum(job.is_complete() for jobs in found.values() for job in jobs))
+    found = chosen(plans)
+    return found if len({_device(job) for jobs in found.values() for job in jobs}) == 1 else next(of_each)
 
 
 def _device(job: Job) -> Any:

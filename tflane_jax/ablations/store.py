@@ -105,7 +105,7 @@ def runs_elsewhere(plan: Sequence[Job], store: Path, replan: Callable[[Mapping[s
         replan: returns the same runs, in the same order, as they are called with another thread setting.
     """
     lines, missing = [], [i for i, job in enumerate(plan) if not job.exists()]
-    for setting in _settings(store) if missing else ():
+    for setting in settings_in(store) if missing else ():
         there, here = replan(setting), plan[0].threads
         found = [there[i] for i in missing if there[i].exists()]
         if found:
@@ -121,7 +121,7 @@ def runs_elsewhere(plan: Sequence[Job], store: Path, replan: Callable[[Mapping[s
     return lines
 
 
-def _settings(store: Path) -> list[dict[str, Any]]:
+def settings_in(store: Path) -> list[dict[str, Any]]:
     """Return the thread settings with which runs in a store began, each once."""
     starts = (read_provenance(path.parent)[:1] for path in sorted(store.glob("*/provenance.json")))
     found = (threads_of(start) for first in starts for start in first)

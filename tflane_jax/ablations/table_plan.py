@@ -13,9 +13,10 @@ from tflane_jax.ablations.declaration import check
 from tflane_jax.ablations.jobs import Job, ScoredBy, check_rows
 from tflane_jax.ablations.paper.table import PaperTable
 from tflane_jax.ablations.reuse import thread_settings, with_recorded
-from tflane_jax.ablations.store import remaining_seconds, runs_elsewhere, stored_jobs
+from tflane_jax.ablations.store import remaining_seconds, runs_elsewhere, settings_in, stored_jobs
 from tflane_jax.ablations.workers import worker_threads
 from tflane_jax.config import RunConfig
+from tflane_jax.errors import UserError
 
 
 @dataclass(frozen=True)
@@ -48,6 +49,10 @@ class TablePlan:
         """Return every run once, those of the hosts first."""
         return list({job.folder: job for jobs in (self.host_jobs, self.jobs) for job in seed_by_seed(jobs)}.values())
 
+    def seeds(self) -> list[int]:
+        """Return the seeds of the rows."""
+        return [job.config.training.seeds[0] for job in next(iter(self.jobs.values()))]
+
     def declared(self) -> dict[str, RunConfig]:
         """Return the configurations of all trainings; a row that starts from a host names it in place of its folder."""
         found = dict(self.rows)
@@ -66,20 +71,25 @@ def plan_table(
     jobs: int = 1,
     cores: int | None = None,
     quick: bool = False,
+    finished: bool = False,
     archive: Archive | None = None,
     scored_by: ScoredBy = "this code",
 ) -> TablePlan:
     """Return the trainings of a table; the arguments are those of `table_run.run_table`.
 
-    Raises UserError where one of them must fail.
+    Raises UserError where one of them must fail; with `finished`, where none is complete.
     """
     rows, hosts = (table.configs(every, quick=quick) for every in (table.rows, table.hosts))
     check(table.declaration, rows)
     archive, store = archive or Archive(table.name, None, {}), store_of(out, quick=quick)
     settings = thread_settings(archive, worker_threads(jobs, cores))
+    if finished:
+        settings += [setting for setting in settings_in(store) if setting not in settings]
     plans = [_planned(table, rows, hosts, seeds, store, threads) for threads in settings]
-    chosen = with_recorded([plan.jobs for plan in plans], archive, table.declaration.scores)
+    chosen = with_recorded([plan.jobs for plan in plans], archive, table.declaration.scores, finished=finished)
     trained = {name: [replace(job, scored_by=scored_by) for job in of_row] for name, of_row in chosen.items()}
+    if finished:
+        return _of_finished(replace(plans[0], jobs=trained, host_jobs={}), store)
     # Hosts are trained only for rows that still start from them: retraining the host of a complete row would make it
     # another run.
     starts = {job.config.training.init_from for of_row in trained.values() for job in of_row if not job.is_complete()}
@@ -89,6 +99,15 @@ def plan_table(
     plan = replace(plans[0], jobs=trained, host_jobs=needed)
     check_rows(plan.named())
     return plan
+
+
+def _of_finished(plan: TablePlan, store: Path) -> TablePlan:
+    """Return the plan with the seeds that any row has finished; raise UserError if there are none."""
+    number = len(next(iter(plan.jobs.values())))
+    kept = [i for i in range(number) if any(jobs[i].is_complete() for jobs in plan.jobs.values())]
+    if not kept:
+        raise UserError(f"no run of {plan.table.name} is finished in {store}: leave out --finished to train them")
+    return replace(plan, jobs={name: [jobs[i] for i in kept] for name, jobs in plan.jobs.items()})
 
 
 def _planned(
@@ -147,6 +166,15 @@ def tell_work(plan: TablePlan, seeds: Sequence[int], store: Path, jobs: int, *, 
     places = [i for i, job in enumerate(same) if job.folder in {job.folder for job in trained}]
     for line in runs_elsewhere([same[i] for i in places], store, lambda setting: [replan(setting)[i] for i in places]):
         print(line, flush=True)
+
+
+def tell_unfinished(plan: TablePlan) -> list[Job]:
+    """Print which runs are not complete, where only complete ones count, and return them."""
+    every = plan.every()
+    waiting = [job for job in every if not job.is_complete()]
+    text = f"{plan.table.name}, {plan.table.title}: {len(every) - len(waiting)} of {len(every)} runs are finished"
+    print(text + (f"; not yet: {'; '.join(job.label for job in waiting)}" if waiting else ""), flush=True)
+    return waiting
 
 
 def _duration(seconds: float) -> str:

@@ -29,18 +29,19 @@ from tflane_jax.ablations.facts import facts, row_minutes
 from tflane_jax.ablations.findings import findings, save_effects
 from tflane_jax.ablations.finished_runs import (
     draw_models,
+    evaluate_others,
     first_models,
     save_plan,
     summary_of,
     train_and_evaluate,
 )
-from tflane_jax.ablations.jobs import Job, ScoredBy
+from tflane_jax.ablations.jobs import Failure, Job, ScoredBy
 from tflane_jax.ablations.paper.table import PaperTable
 from tflane_jax.ablations.results import Results
 from tflane_jax.ablations.reuse import FILE, archive_of, unused
 from tflane_jax.ablations.scores import CHECKPOINTS, OWN_TEST, code_digest, evaluations, measure
 from tflane_jax.ablations.store import TOPOLOGY
-from tflane_jax.ablations.table_plan import plan_table, seed_by_seed, store_of, tell_work
+from tflane_jax.ablations.table_plan import plan_table, seed_by_seed, store_of, tell_unfinished, tell_work
 from tflane_jax.datasets.sources import source_of
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import write_json, write_text
@@ -60,6 +61,7 @@ def run_table(
     jobs: int = 1,
     cores: int | None = None,
     quick: bool = False,
+    finished: bool = False,
     archive: Archive | None = None,
     scored_by: ScoredBy = "this code",
 ) -> Path:
@@ -75,6 +77,8 @@ def run_table(
         jobs: trainings at a time.
         cores: of each training; None shares all between the trainings.
         quick: few updates on few data, below `<out>/quick`: a smoke test, no result.
+        finished: train nothing; the table is of the runs that are complete, with any number of cores and on any one
+            device.
         archive: recorded runs, which are taken instead of trained; None for none.
         scored_by: state of the code whose scores count where they are kept beside a run, see `Job`.
 
@@ -82,13 +86,15 @@ def run_table(
         The file of the table.
 
     Raises:
-        UserError: trainings failed, after the files of the others were written.
+        UserError: trainings failed, after the files of the others were written; with `finished`, no run is.
     """
     began, folder = time.monotonic(), store_of(out, quick=quick).parent / table.name
-    planned = plan_table(table, seeds, out, jobs=jobs, cores=cores, quick=quick, archive=archive, scored_by=scored_by)
+    how: dict[str, Any] = {"quick": quick, "finished": finished, "archive": archive, "scored_by": scored_by}
+    planned = plan_table(table, seeds, out, jobs=jobs, cores=cores, **how)
     configs, plan = planned.rows, planned.jobs
     # Fewer seeds than the table has are an interim look at it.
     every = range(max(len(seeds), 0 if quick else table.seeds))
+    seeds = planned.seeds()
     if archive is not None:
         _adopt_declaration(
             archive, folder, lambda trial: declare(table.declaration, plan, planned.declared(), every, trial)
@@ -102,10 +108,13 @@ def run_table(
             raise
         (folder / DECLARATION).unlink()  # that of an earlier smoke test, which was no result
         declared = declare(table.declaration, plan, planned.declared(), every, folder)
-    tell_work(planned, seeds, store_of(out, quick=quick), jobs, quick=quick)
-
-    results = Results(tuple(configs), tuple(seeds), {})
-    trained, failures = train_and_evaluate(plan, seed_by_seed(planned.named()), results, jobs, cores)
+    results, waiting = Results(tuple(configs), tuple(seeds), {}), []
+    if finished:
+        waiting = [Failure(job, "not finished") for job in tell_unfinished(planned)]
+        trained, failures = evaluate_others(plan, waiting, results)
+    else:
+        tell_work(planned, seeds, store_of(out, quick=quick), jobs, quick=quick)
+        trained, failures = train_and_evaluate(plan, seed_by_seed(planned.named()), results, jobs, cores)
     _add_geometric(trained, results)
     save_plan(plan, failures, results, folder)
     if not results.scores:
@@ -124,8 +133,8 @@ def run_table(
     _draw_curves(table, trained, folder / "curves.png")
     _save_summary(table, declared, results, trained, tested, folder, quick=quick)
     print(f"\n{table.name}: {folder} has tables, tests, curves and pictures ({time.monotonic() - began:.0f} s)")
-    if failures:
-        raise UserError(summary_of(failures, len(planned.every())))
+    if failed := failures[len(waiting) :]:
+        raise UserError(summary_of(failed, len(planned.every())))
     return path
 
 

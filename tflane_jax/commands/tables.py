@@ -48,7 +48,7 @@ def run(options: argparse.Namespace) -> int:
     configure_jax()
     if jobs > 1 or options.cores is not None:
         accelerators.leave_to_workers()  # before converting uses a device
-    for table in chosen:
+    for table in chosen if not options.finished else ():
         _convert(table.conversions)
     if options.search:
         from tflane_jax.ablations.rate_search import search_rates
@@ -60,7 +60,7 @@ def run(options: argparse.Namespace) -> int:
     from tflane_jax.ablations.table_plan import plan_table
     from tflane_jax.ablations.table_run import run_table
 
-    how: dict[str, Any] = {"jobs": jobs, "cores": options.cores, "quick": options.quick}
+    how: dict[str, Any] = {"jobs": jobs, "cores": options.cores, "quick": options.quick, "finished": options.finished}
     how["scored_by"] = "any code" if options.earlier_scores else "this code"
     seeds = {table.name: range(options.seeds or (2 if options.quick else table.seeds)) for table in chosen}
     archives = {} if options.source is None else find_archives(options.source, [table.name for table in chosen])
@@ -109,13 +109,16 @@ def _check_together(options: argparse.Namespace) -> None:
         "--steps-factor": options.steps_factor != 1,
         "--quick": options.quick,
         "--search": options.search,
+        "--finished": options.finished,
     }
     names = [name for name, is_given in given.items() if is_given]
     if not options.names and (idle := [name for name in names if name != "--record"]):
         raise UserError(f"{idle[0]} is about a table: name one (tflane tables lists all)")
     if options.quick and (idle := [name for name in names if name in ("--record", "--from")]):
         raise UserError(f"--quick runs are no results and never recorded: leave out {idle[0]} or --quick")
-    of_runs = ("--seeds", "--record", "--from", "--earlier-scores")
+    if options.finished and (idle := [name for name in names if name in ("--jobs", "--cores")]):
+        raise UserError(f"--finished trains nothing: leave out {idle[0]}")
+    of_runs = ("--seeds", "--record", "--from", "--earlier-scores", "--finished")
     if options.search and (idle := [name for name in names if name in of_runs]):
         raise UserError(f"--search trains other runs than the table's, with its own seeds: leave out {idle[0]}")
 

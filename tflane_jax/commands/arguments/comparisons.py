@@ -127,6 +127,11 @@ def tables(commands) -> None:
         help="take the runs that are recorded in DIR instead of training them, such as docs/results",
     )
     parser.add_argument(
+        "--finished",
+        action="store_true",
+        help="train nothing: make the table of the runs that are complete, whatever cores or GPU trained them",
+    )
+    parser.add_argument(
         "--earlier-scores",
         action="store_true",
         help="keep scores of complete runs that an earlier state of the code measured (default: measure again)",

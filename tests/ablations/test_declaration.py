@@ -8,7 +8,7 @@ import pytest
 from tests.ablations.test_identity import QUICK
 from tests.test_cli import fakes  # noqa: F401 (a fixture that is used by itself)
 from tflane_jax.ablations import workers
-from tflane_jax.ablations.declaration import Claim, Declaration, check, declare
+from tflane_jax.ablations.declaration import Claim, Declaration, Declared, check, declare
 from tflane_jax.ablations.jobs import plan_jobs
 from tflane_jax.cli import main
 from tflane_jax.config import load_config
@@ -137,6 +137,12 @@ def declared(tiny, out, declaration=CLAIMED, seeds=(0, 1), logs=(), content=None
     configs = {"base": config, "tfm": replace(config, training=replace(config.training, **settings))}
     plan = plan_jobs(configs, seeds, out / "runs", threads={"cores": 1}, tests={})
     return declare(declaration, plan, configs, seeds, out, logs=logs, content=content)
+
+
+def test_a_treatment_with_a_comma_in_its_name_is_quoted():
+    claims = (Claim("GTN"), Claim("GTN, Eq. (2)", "GTN"), Claim("GTN", "GCN"))
+    text = Declared(Declaration("all/recall", claims), (0,), "2026-11-26", 0).sentence()
+    assert 'treatment GTN, "GTN, Eq. (2)", level 0.05' in text
 
 
 def test_the_configurations_of_the_rows_are_declared(tiny, tmp_path):

@@ -96,7 +96,8 @@ class Declared:
             what += f", negative control {self.declaration.negative_control}"
         runs = "1 run" if self.begun == 1 else f"{self.begun} runs"
         when = "before any run" if self.begun == 0 else f"when {runs} had begun already"
-        treatments = ", ".join(dict.fromkeys(claim.treatment for claim in self.declaration.claims))
+        names = dict.fromkeys(claim.treatment for claim in self.declaration.claims)
+        treatments = ", ".join(f'"{name}"' if "," in name else name for name in names)
         seeds = "1 seed" if len(self.seeds) == 1 else f"{len(self.seeds)} seeds"
         text = (
             f"Declared {when} ({self.time}): {what}, treatment {treatments}, level {self.declaration.alpha:g}, {seeds}."

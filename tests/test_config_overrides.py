@@ -1,16 +1,19 @@
 """Settings changed by arguments: what they change, and errors that name the setting."""
 
 import argparse
+import contextlib
 import dataclasses
+import io
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import tyro
 
 from tflane_jax.commands import train
 from tflane_jax.config import OpenLaneV2Data, RunConfig, epochs_of
 from tflane_jax.config_io import from_json, settings, to_json
-from tflane_jax.config_overrides import apply_overrides, batch_notices
+from tflane_jax.config_overrides import _without_boxes, apply_overrides, batch_notices
 from tflane_jax.errors import UserError
 from tflane_jax.markers.simulation import MarkerConfig, MarkerSimulationConfig
 from tflane_jax.models.marker_fusion import MarkerFusionConfig
@@ -43,6 +46,35 @@ def test_overrides_change_only_the_named_setting(arguments, changed):
     before, after = dict(settings(FLOW)), dict(settings(apply_overrides(FLOW, arguments)))
     differing = {k: v for k, v in after.items() if v != before[k] and not dataclasses.is_dataclass(v)}
     assert differing == changed
+
+
+WHOLE = [
+    # A number, flags set and cleared, several values, a choice, enumerations, optional numbers and text, negative ones.
+    ["--optim.lr", "1e-3", "--training.shard-state", "--training.seeds", "4", "5", "--task.losses.matcher=scipy"],
+    ["--task.model.encoder.no-cells", "--training.init-from", "None", "--task.model.range.z", "-3", "2"],
+    ["--task.model.encoder.range.x", "-10", "20.5", "--data.world.roads.kinds", "ROAD", "0.5", "EXIT_RAMP", "0.5"],
+    ["--task.model.priors.traffic_flow.prior.top_instances", "3", "--optim.lr", "1", "--optim.lr", "2"],
+    ["--training.seeds", "4", "five"],
+    ["--training.shard-state", "yes", "--optim.lr", "1e-3"],
+    ["--task.model.encoder.range.x", "-10"],
+    ["--data.world.roads.kinds", "RIVER", "0.5"],
+    ["--optim.lr", "1e-3", "stray", "words"],
+]
+
+
+@pytest.mark.parametrize("arguments", WHOLE)
+def test_arguments_are_read_as_those_of_the_whole_configuration(arguments):
+    """tyro gets the named settings alone, because it takes a third of a second for all of them."""
+    output = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(output), contextlib.redirect_stdout(output):
+            whole = tyro.cli(RunConfig, default=FLOW, args=arguments, config=(tyro.conf.AvoidSubcommands,))
+    except SystemExit:
+        with pytest.raises(UserError) as error:
+            apply_overrides(FLOW, arguments)
+        assert str(error.value) == _without_boxes(output.getvalue())
+    else:
+        assert apply_overrides(FLOW, arguments) == whole
 
 
 def test_parts_are_switched_on_and_off():

@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import enum
+import functools
 import importlib
 import json
 import pkgutil
@@ -83,9 +84,7 @@ def subclasses(kind: type) -> dict[str, type]:
         UserError: an own class has the name of a shipped one.
     """
     if _is_abstract(kind):
-        package = importlib.import_module(kind.__module__.rpartition(".")[0])
-        for module in pkgutil.iter_modules(package.__path__):
-            importlib.import_module(f"{package.__name__}.{module.name}")
+        _import_all(kind.__module__.rpartition(".")[0])
     found, waiting = {}, [kind]
     while waiting:
         each = waiting.pop(0)
@@ -98,6 +97,18 @@ def subclasses(kind: type) -> dict[str, type]:
             )
         found[each.__name__] = each
     return found
+
+
+@functools.cache
+def _import_all(name: str) -> None:
+    """Import all modules of a package."""
+    package = importlib.import_module(name)
+    for module in pkgutil.iter_modules(package.__path__):
+        importlib.import_module(f"{name}.{module.name}")
+
+
+# Classes of configuration files are made anew with every load, so that not all of them may be kept.
+_hints = functools.lru_cache(maxsize=1024)(typing.get_type_hints)
 
 
 def _is_open(kind: Any) -> TypeGuard[type]:
@@ -157,12 +168,14 @@ def _shown(value: Any) -> str:
 
 def _dataclass(kind: Any, content: Any, path: str) -> Any:
     if isinstance(content, dict) and _is_open(kind):
-        _check_known(content, path.removesuffix("."))
-        kind = subclasses(kind).get(str(content.get("class", "")), kind)
+        known, name = subclasses(kind), str(content.get("class", ""))
+        if name not in known:
+            _check_known(content, path.removesuffix("."))
+        kind = known.get(name, kind)
     if not isinstance(content, dict) or content.get("class") != kind.__name__:
         name = path.removesuffix(".") or "at the top"
         raise UserError(f"setting {name} should be a {kind.__name__}, not {content!r:.80}")
-    hints = typing.get_type_hints(kind)
+    hints = _hints(kind)
     names = {field.name for field in dataclasses.fields(kind)}
     unknown = sorted(content.keys() - names - {"class"})
     if unknown:

@@ -108,7 +108,7 @@ def curves(records: Iterable[Mapping[str, Any]]) -> dict[tuple[str, str], Series
     }
 
 
-def _styles(names: Iterable[str]) -> dict[str, dict[str, str]]:
+def _styles(names: Iterable[str]) -> dict[str, dict[str, Any]]:
     """Return a colour and a line style for each curve; matplotlib's ten colours come again with other lines."""
     return {
         name: {"color": f"C{number % 10}", "linestyle": ("-", "--", ":")[number // 10 % 3]}
@@ -117,7 +117,7 @@ def _styles(names: Iterable[str]) -> dict[str, dict[str, str]]:
 
 
 def _draw_panel(
-    ax: Axes, series: Mapping[str, Series], styles: Mapping[str, Mapping[str, str]], *, log: bool = False
+    ax: Axes, series: Mapping[str, Series], styles: Mapping[str, Mapping[str, Any]], *, log: bool = False
 ) -> None:
     from matplotlib.ticker import MaxNLocator
 

@@ -28,7 +28,7 @@ else:
     atexit.register(shutil.rmtree, _programs, ignore_errors=True)
     os.environ["JAX_COMPILATION_CACHE_DIR"] = _programs
 jax.config.update("jax_compilation_cache_dir", _programs)
-jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.15)
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
 # No test survives a power failure: waiting for the device at every file costs a tenth of the tests that write.
 os.fsync = lambda handle: None
 # Tracing makes millions of objects and hardly any garbage: collecting at the default rate costs a tenth of the time.

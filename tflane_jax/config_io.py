@@ -107,10 +107,6 @@ def _import_all(name: str) -> None:
         importlib.import_module(f"{name}.{module.name}")
 
 
-# Classes of configuration files are made anew with every load, so that not all of them may be kept.
-_hints = functools.lru_cache(maxsize=1024)(typing.get_type_hints)
-
-
 def _is_open(kind: Any) -> TypeGuard[type]:
     """Return whether a setting of this type accepts subclasses."""
     return isinstance(kind, type) and dataclasses.is_dataclass(kind) and getattr(kind, "open_base", False)
@@ -175,7 +171,7 @@ def _dataclass(kind: Any, content: Any, path: str) -> Any:
     if not isinstance(content, dict) or content.get("class") != kind.__name__:
         name = path.removesuffix(".") or "at the top"
         raise UserError(f"setting {name} should be a {kind.__name__}, not {content!r:.80}")
-    hints = _hints(kind)
+    hints = typing.get_type_hints(kind)
     names = {field.name for field in dataclasses.fields(kind)}
     unknown = sorted(content.keys() - names - {"class"})
     if unknown:

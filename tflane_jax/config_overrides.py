@@ -48,16 +48,14 @@ def apply_overrides(config: RunConfig, arguments: Sequence[str]) -> RunConfig:
 
     given, names = config, {_setting(argument) for argument in arguments} - {""}
     config, arguments = _choose_parts(config, arguments)
-    changed_names = _check_names(config, arguments)
+    kind, default = _with_only(config, _checked_names(config, arguments))
     output = io.StringIO()
     try:
         with contextlib.redirect_stderr(output), contextlib.redirect_stdout(output):
-            kind, default = _with_only(config, changed_names)
             parsed = tyro.cli(kind, default=default, args=list(arguments), config=(tyro.conf.AvoidSubcommands,))
     except SystemExit as error:
         raise UserError(_without_boxes(output.getvalue())) from error
-    changed = _merged(config, parsed)
-    changed = with_same_examples(with_reference_batch(changed, given), given, names)
+    changed = with_same_examples(with_reference_batch(_merged(config, parsed), given), given, names)
     check_settings(changed, "--")
     return changed
 
@@ -137,7 +135,7 @@ def _setting(argument: str) -> str:
     return argument.partition("=")[0].removeprefix("--").replace("-", "_") if argument.startswith("--") else ""
 
 
-def _check_names(config: RunConfig, arguments: Sequence[str]) -> set[str]:
+def _checked_names(config: RunConfig, arguments: Sequence[str]) -> set[str]:
     """Return the settings that arguments change; raise UserError for one that there is not."""
     known, found = override_names(config), set()
     for argument in arguments:

@@ -9,7 +9,6 @@ because files carry no version number. A setting that is new needs no entry: it 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 from tflane_jax.errors import UserError
@@ -35,16 +34,12 @@ def migrate(content: Json, migrations: Sequence[Migration] | None = None) -> tup
         UserError: a removed setting has a value that this version no longer supports.
     """
     notices: list[str] = []
-    try:
-        classes = set(_classes(content))
-        for migration in MIGRATIONS if migrations is None else migrations:
-            if isinstance(migration, _AtClass) and migration.kind not in classes:
-                continue  # most of them, and each would copy the whole tree
+    for migration in MIGRATIONS if migrations is None else migrations:
+        try:
             content, more = migration(content)
-            notices += more
-            classes = set(_classes(content))
-    except (KeyError, TypeError, AttributeError, ValueError, RecursionError) as error:
-        raise UserError(f"the saved configuration is damaged ({type(error).__name__}: {error})") from error
+        except (KeyError, TypeError, AttributeError, ValueError, RecursionError) as error:
+            raise UserError(f"the saved configuration is damaged ({type(error).__name__}: {error})") from error
+        notices += more
     return content, notices
 
 
@@ -58,7 +53,7 @@ def renamed_class(old: str, new: str) -> Migration:
     def rename(node: Json, path: str, root: Json) -> tuple[Json, list[str]]:
         return node | {"class": new}, []
 
-    return _AtClass(old, rename)
+    return _at_class(old, rename)
 
 
 def renamed_setting(kind: str, old: str, new: str) -> Migration:
@@ -67,7 +62,7 @@ def renamed_setting(kind: str, old: str, new: str) -> Migration:
     def rename(node: Json, path: str, root: Json) -> tuple[Json, list[str]]:
         return {new if name == old else name: value for name, value in node.items()}, []
 
-    return _AtClass(kind, rename)
+    return _at_class(kind, rename)
 
 
 def removed_setting(kind: str, name: str, always: Any, *, instead: str = "") -> Migration:
@@ -97,7 +92,7 @@ def removed_setting(kind: str, name: str, always: Any, *, instead: str = "") -> 
             )
         return kept, [f"setting {path}{name} no longer exists: its value, {saved}, is what this version always uses"]
 
-    return _AtClass(kind, remove)
+    return _at_class(kind, remove)
 
 
 def unused_setting(kind: str, name: str) -> Migration:
@@ -112,7 +107,7 @@ def unused_setting(kind: str, name: str) -> Migration:
         kept = {key: value for key, value in node.items() if key != name}
         return kept, [f"setting {path}{name} no longer exists: its value, {node[name]}, never had an effect"]
 
-    return _AtClass(kind, remove)
+    return _at_class(kind, remove)
 
 
 def moved_setting(old: str, new: str) -> Migration:
@@ -142,7 +137,7 @@ def nested_settings(kind: str, names: Sequence[str], part: str, part_kind: str) 
         kept = {name: value for name, value in node.items() if name not in moved}
         return kept | {part: {"class": part_kind} | moved | (node.get(part) or {})}, []
 
-    return _AtClass(kind, nest)
+    return _at_class(kind, nest)
 
 
 def value_at(root: Json, name: str, default: Any = None) -> Any:
@@ -155,14 +150,12 @@ def value_at(root: Json, name: str, default: Any = None) -> Any:
     return node
 
 
-@dataclass(frozen=True)
-class _AtClass:
-    """The migration that applies `change` (node, "path.to.it.", root) -> (node, notices) to every node of a class."""
+def _at_class(kind: str, change: Callable[[Json, str, Json], tuple[Json, list[str]]]) -> Migration:
+    """Return the migration that applies (node, "path.to.it.", root) -> (node, notices) to every node of a class."""
 
-    kind: str
-    change: Callable[[Json, str, Json], tuple[Json, list[str]]]
-
-    def __call__(self, root: Json) -> tuple[Json, list[str]]:
+    def apply(root: Json) -> tuple[Json, list[str]]:
+        if kind not in _classes(root):
+            return root, []  # the rule, for which the tree need not be copied
         notices: list[str] = []
 
         def walk(value: Any, path: str) -> Any:
@@ -171,24 +164,22 @@ class _AtClass:
             if not isinstance(value, dict):
                 return value
             node = {name: walk(item, f"{path}{name}.") for name, item in value.items()}
-            if node.get("class") != self.kind:
+            if node.get("class") != kind:
                 return node
-            node, more = self.change(node, path, root)
+            node, more = change(node, path, root)
             notices.extend(more)
             return node
 
         return walk(root, ""), notices
 
+    return apply
 
-def _classes(value: Any) -> Iterator[str]:
+
+def _classes(value: Any) -> Iterator[Any]:
     """Yield the names of the classes of all parts of a configuration."""
     if isinstance(value, dict):
-        if isinstance(name := value.get("class"), str):
-            yield name
-        value = value.values()
-    elif not isinstance(value, list):
-        return
-    for item in value:
+        yield value.get("class")
+    for item in value.values() if isinstance(value, dict) else value:
         if isinstance(item, (dict, list)):
             yield from _classes(item)
 
@@ -269,13 +260,13 @@ MIGRATIONS: tuple[Migration, ...] = (
     nested_settings("BevFormerDetrConfig", ("sd_map", "markers"), "priors", "PriorsConfig"),
     removed_setting("LaneGraphLossConfig", "control_points", lambda root: value_at(root, f"{_MODEL}.control_points")),
     _loss_of_host,
-    _AtClass("OptimConfig", _unused_reference_batch),
+    _at_class("OptimConfig", _unused_reference_batch),
     # Settings belong to the classes that read them.
     _edge_weight_of_scene_graph,
     unused_setting("LaneDecoderConfig", "edge_weight"),
     unused_setting("SegmentDecoderConfig", "edge_weight"),
     unused_setting("MapTrLossConfig", "cell_weight"),
     unused_setting("MapTrV2LossConfig", "cell_weight"),
-    _AtClass("StreamingConfig", _former_workers),
+    _at_class("StreamingConfig", _former_workers),
     removed_setting("LaneSegNetLossConfig", "successor_mean", "negatives"),
 )

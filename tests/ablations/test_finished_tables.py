@@ -79,7 +79,7 @@ def test_a_run_without_its_parameters_counts_but_is_not_drawn(tiny, trained, mon
     (trained / "paper.9" / "comparison.png").unlink()
     capsys.readouterr()
     run_table(small(tiny), range(3), trained, finished=True)
-    assert "base is not drawn: checkpoint" in capsys.readouterr().out
+    assert "base is not drawn: the parameters in " in capsys.readouterr().out
     assert summary(trained)["seeds"] == [0, 1, 2]
     assert not (trained / "paper.9" / "comparison.png").exists()
 

@@ -87,8 +87,8 @@ def first_models(trained: Mapping[str, Sequence[Job]], results: Results) -> dict
         if results.has(name) and job is not None:
             try:
                 run = open_run(job.folder, "last")
-            except UserError as error:
-                print(f"{name} is not drawn: {error}")
+            except UserError:
+                print(f"{name} is not drawn: the parameters in {job.folder / 'checkpoints'} are missing or damaged")
                 continue
             models[name] = Model(run.config.task, run.params[0])
     return models

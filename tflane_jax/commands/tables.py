@@ -48,8 +48,9 @@ def run(options: argparse.Namespace) -> int:
     configure_jax()
     if jobs > 1 or options.cores is not None:
         accelerators.leave_to_workers()  # before converting uses a device
-    for table in chosen if not options.finished else ():
-        _convert(table.conversions)
+    if not options.finished:
+        for table in chosen:
+            _convert(table.conversions)
     if options.search:
         from tflane_jax.ablations.rate_search import search_rates
 

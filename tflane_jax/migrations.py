@@ -8,7 +8,7 @@ because files carry no version number. A setting that is new needs no entry: it 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from tflane_jax.errors import UserError
@@ -154,8 +154,6 @@ def _at_class(kind: str, change: Callable[[Json, str, Json], tuple[Json, list[st
     """Return the migration that applies (node, "path.to.it.", root) -> (node, notices) to every node of a class."""
 
     def apply(root: Json) -> tuple[Json, list[str]]:
-        if kind not in _classes(root):
-            return root, []  # the rule, for which the tree need not be copied
         notices: list[str] = []
 
         def walk(value: Any, path: str) -> Any:
@@ -173,15 +171,6 @@ def _at_class(kind: str, change: Callable[[Json, str, Json], tuple[Json, list[st
         return walk(root, ""), notices
 
     return apply
-
-
-def _classes(value: Any) -> Iterator[Any]:
-    """Yield the names of the classes of all parts of a configuration."""
-    if isinstance(value, dict):
-        yield value.get("class")
-    for item in value.values() if isinstance(value, dict) else value:
-        if isinstance(item, (dict, list)):
-            yield from _classes(item)
 
 
 def _replaced(node: Json, parts: Sequence[str], value: Any) -> Json:

@@ -28,6 +28,7 @@ from typing import Any, Protocol
 import numpy as np
 
 import tflane_jax
+from tflane_jax.cores import working_cores
 from tflane_jax.datasets.base import FrameInfo, IndexedExamples
 from tflane_jax.datasets.leaves import example_from_leaves
 from tflane_jax.datasets.parallel import fill, frame_leaves, leaf_path
@@ -84,8 +85,8 @@ def cached(
     Args:
         dataset: its examples all have the same shapes.
         root: folder of the entries, default `cache_root()`.
-        workers: processes that build, default one per core; the result does not depend on it. For more than one the
-            caller's script must be guarded by `if __name__ == "__main__":`.
+        workers: processes that build, by default `cores.working_cores`; the result does not depend on it. For more
+            than one the caller's script must be guarded by `if __name__ == "__main__":`.
         progress: show a bar with rate and time left while building.
 
     Raises:
@@ -107,7 +108,7 @@ def cached(
             # Another process may have finished it while this one waited for the lock.
             with contextlib.suppress(DamagedEntry, FileNotFoundError):
                 return CachedDataset(folder)
-            _build(dataset, folder, mark, workers or os.cpu_count() or 1, progress)
+            _build(dataset, folder, mark, workers or working_cores(), progress)
     except OSError as error:
         raise _explain(error, root) from error
     return CachedDataset(folder)

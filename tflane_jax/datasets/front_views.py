@@ -101,8 +101,8 @@ def load_road_images(config: FrontViewConfig, *, progress: bool = True, workers:
     Args:
         config: which images.
         progress: show a bar with rate and time left while they are made.
-        workers: processes that make them, default one per core. For more than one the caller's script must be guarded
-            by `if __name__ == "__main__":`.
+        workers: processes that make them, by default `cores.working_cores`. For more than one the caller's script must
+            be guarded by `if __name__ == "__main__":`.
 
     Raises:
         UserError: ids outside the split, a severity outside [0, 1], a full disk, or a folder that cannot be written.

@@ -11,7 +11,6 @@ The folder may hold label files and `clips` itself, in `LaneDetection` (LSTR's l
 
 from __future__ import annotations
 
-import os
 from collections.abc import Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -20,6 +19,7 @@ from typing import Literal
 
 import numpy as np
 
+from tflane_jax.cores import working_cores
 from tflane_jax.datasets.augmentation import AugmentationConfig
 from tflane_jax.datasets.base import SPLITS, FrameInfo, Split
 from tflane_jax.datasets.data_source import Choice, DataSource, FolderCheck, loading_of
@@ -160,7 +160,7 @@ def load_road_images(dataset: TuSimpleDataset, *, progress: bool = True, workers
     """
     count, config = len(dataset), dataset.config
     images = np.empty((count, config.height, config.width, 3), np.uint8)
-    workers = min(os.cpu_count() or 1, 8) if workers is None else workers
+    workers = min(working_cores(), 8) if workers is None else workers
 
     def load(index: int) -> LaneLines:
         example = dataset.example(index)

@@ -29,6 +29,8 @@ else:
     os.environ["JAX_COMPILATION_CACHE_DIR"] = _programs
 jax.config.update("jax_compilation_cache_dir", _programs)
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
+# XLA reads its flags when JAX first asks for devices, which must not be inside a test that changes them.
+jax.devices()
 # No test survives a power failure: waiting for the device at every file costs a tenth of the tests that write.
 os.fsync = lambda handle: None
 # Tracing makes millions of objects and hardly any garbage: collecting at the default rate costs a tenth of the time.

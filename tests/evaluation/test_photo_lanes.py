@@ -4,7 +4,14 @@ import numpy as np
 import pytest
 
 from tflane_jax.datasets.photos import HORIZON, Placement
-from tflane_jax.evaluation.photo_lanes import common_horizon, is_blank, judge_lanes, without_crossings
+from tflane_jax.evaluation.photo_lanes import (
+    agreement,
+    common_horizon,
+    is_blank,
+    judge_lanes,
+    plausibility,
+    without_crossings,
+)
 
 cv2 = pytest.importorskip("cv2")
 WHOLE = Placement(0, 0, 1280, 720)
@@ -37,7 +44,6 @@ def judged(grey, lanes, view=WHOLE):
 def test_lanes_on_paint_that_meet_on_the_horizon_are_plausible():
     found = judged(road(), [lane(foot) for foot in FEET])
     assert found.value > 1.0
-    assert found.rank == pytest.approx(found.value)
     assert not found.crossed
     assert found.meeting == pytest.approx((640, HORIZON * 720), abs=2)
     assert min(found.paint) > 0.7
@@ -68,12 +74,15 @@ def test_a_part_of_a_photo_is_judged_like_the_whole():
 def test_other_lanes_are_not(lanes, most):
     found = judged(road(), lanes)
     assert found.value <= most + 1e-3
-    assert found.rank <= 1e-3
 
 
 def test_crossed_lanes_are_told():
     assert judged(road(), [lane(0.15, ahead=0.8), lane(0.85, ahead=0.2)]).crossed
     assert not judged(road(), [lane(0.15), lane(0.85)]).crossed
+    # Straight lines through them meet on the horizon, but one bends across the other.
+    bent = lane(0.85)
+    bent[:, 0] -= 0.8 * np.sin(np.pi * (bent[:, 1] - HORIZON) / (1.0 - HORIZON)) ** 8
+    assert judged(road(), [lane(0.15), bent]).crossed
 
 
 def test_an_arrow_is_no_lane_line():
@@ -95,6 +104,27 @@ def test_the_horizon_is_where_most_lanes_meet():
     found = [judged(grey, lanes), judged(grey, lanes[1:3]), judged(grey, other), judged(grey, [])]
     assert common_horizon(found, 720) == pytest.approx((640, HORIZON * 720), abs=3)
     assert common_horizon([judged(grey, [])], 720) is None
+
+
+def test_lanes_agree_as_far_as_other_views_show_them():
+    one, other, short = (lane(foot) * (1280, 720) for foot in (0.15, 0.85, 0.15))
+    short = short[50:]
+    shown = agreement([one, other, short], [[one, other], [short], []], [0.6, 0.2, 0.2], (720, 1280))
+    np.testing.assert_allclose(shown, [0.6 + 0.2 * 0.5, 0.6, 0.8], atol=0.02)
+    beside = one + np.array([0.03 * 1280, 0])
+    np.testing.assert_allclose(agreement([beside], [[one]], [1.0], (720, 1280)), 0, atol=0.02)
+    assert agreement([], [[one]], [1.0], (720, 1280)).shape == (0,)
+    np.testing.assert_array_equal(agreement([one, one[:0]], [], [], (720, 1280)), [0, 0])
+
+
+def test_of_equal_views_that_with_longer_lanes_and_more_agreement_is_more_plausible():
+    lanes = [lane(0.15) * (1280, 720), lane(0.85) * (1280, 720)]
+    agreed = np.array([0.5, 0.5])
+    whole = plausibility(0.3, agreed, lanes, 720)
+    assert plausibility(0.3, agreed, [one[:50] for one in lanes], 720) == pytest.approx(whole * 49 / 99)
+    assert plausibility(0.3, agreed / 4, lanes, 720) == pytest.approx(whole / 2)
+    assert plausibility(0.0, agreed, lanes, 720) == 0
+    assert plausibility(0.3, agreed[:0], [], 720) == 0
 
 
 @pytest.mark.parametrize(

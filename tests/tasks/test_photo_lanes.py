@@ -104,7 +104,6 @@ def test_a_known_camera_is_not_searched(network):
 
 def test_a_known_camera_that_gives_no_view_like_tusimples_is_a_warning(network):
     assert reader().read(photo(), PhotoCamera(horizon=449)).warning == ""
-    assert "too few rows above row 100" in reader().read(photo(), PhotoCamera(horizon=100)).warning
     assert "distorted to 16:9" in reader().read(photo(), PhotoCamera(horizon=880)).warning
 
 
@@ -152,6 +151,18 @@ def test_the_threshold_chooses_the_lanes(network):
     known = PhotoCamera(horizon=449)
     assert [len(reader(t).read(photo(), known).lanes) for t in (0.0, 0.5, 0.65, 0.99)] == [4, 3, 2, 0]
     assert sorted(reader(0.65).read(photo(), known).scores) == pytest.approx([0.7, 0.95])
+
+
+def test_the_threshold_does_not_choose_the_view(network):
+    network["scores"] = np.array([0.95, 0.4, 0.7, 0.6])
+    found = {threshold: reader(threshold).read(photo()) for threshold in (0.1, 0.5, 0.65)}
+    assert len({one.view for one in found.values()}) == 1
+    assert len({one.value for one in found.values()}) == 1
+    assert [sorted(one.scores) for one in found.values()] == [
+        pytest.approx([0.4, 0.6, 0.7, 0.95]),
+        pytest.approx([0.6, 0.7, 0.95]),
+        pytest.approx([0.7, 0.95]),
+    ]
 
 
 def test_a_lane_that_ends_above_its_beginning_is_none(network):

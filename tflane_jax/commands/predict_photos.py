@@ -7,8 +7,9 @@ predictions.json, and one picture or video (MP4) for each input:
      "faults": [{"file", "error"}, ...]}
     LANES is [{"score", "paint", "points": [[column, row], ...]}, ...]: pixels, from the upper end of a lane to the
     lower end; lanes are in order from left to right. `paint` is the fraction of the lane that lies on paint, `view` the
-    part of the photo that the network saw ({"left", "top", "width", "height"}), `value` its plausibility. `faults` are
-    files that could not be read or that the camera does not fit; `complete` is false until all others are done.
+    part of the photo that the network saw ({"left", "top", "width", "height"}; `top` is negative where black rows were
+    added), `value` its plausibility. `faults` are files that could not be read or that the camera does not fit;
+    `complete` is false until all others are done.
 """
 
 from __future__ import annotations

@@ -24,8 +24,8 @@ HORIZON = 0.331
 # either.
 FOCAL = 714.15 / 1280
 
-# How far off the horizon of a view may be, of its height, and its aspect, a factor: 4:3 and 21:9 pass.
-_LEVEL, _ALIKE = 0.05, 1.5
+# How far off the aspect of a view may be, a factor: 4:3 and 21:9 pass.
+_ALIKE = 1.5
 # If TuSimple's view is a smaller fraction of the photo's width than this, the focal length is in wrong units.
 _LEAST_SEEN = 0.1
 
@@ -51,7 +51,7 @@ class Placement:
     """The part of a photo that the network sees, pixels.
 
     Attributes:
-        left, top: its corner.
+        left, top: its corner; `top` is negative where rows above the photo are seen, which are black.
         width, height: its size.
     """
 
@@ -77,14 +77,15 @@ def fit_photo(image: UInt8[np.ndarray, "h w 3"], camera: PhotoCamera | Placement
     """Return the network's view of a photo of any size: what a camera tells, or a part of the photo.
 
     Without a camera the whole photo is stretched to the network's size, as by the reference. A known camera removes
-    what TuSimple's camera would not have seen. A horizon cuts rows off the top until it has TuSimple's height, where
-    the photo has enough rows above it; `misfits` says where not. A focal length shorter than TuSimple's cuts the sides
-    and, with a horizon, the bottom.
+    what TuSimple's camera would not have seen. A horizon cuts rows off the top, or adds black ones, until it has
+    TuSimple's height. A focal length shorter than TuSimple's cuts the sides and, with a horizon, the bottom.
 
-    Nothing is padded and the aspect is not kept. With the published LSTR weights on TuSimple frames cut to other shapes
-    (ten frames, all seen in training), padding and cutting to 16:9 did worse than stretching in most shapes (1280 x 540
-    from the top: accuracy 0.71 padded, 0.90 with the sides cut, 0.93 stretched), and cutting above a known horizon did
-    better than not in 8 of 9 (880 x 500: 0.97 against 0.92). A short focal length could not be tried in this way.
+    The aspect is not kept. With the published LSTR weights on TuSimple frames cut to other shapes (ten frames, all seen
+    in training), padding and cutting to 16:9 did worse than stretching in most shapes (1280 x 540 from the top:
+    accuracy 0.71 padded, 0.90 with the sides cut, 0.93 stretched), and cutting above a known horizon did better than
+    not in 8 of 9 (880 x 500: 0.97 against 0.92). A short focal length could not be tried in this way. Of frames whose
+    upper 150 rows were cut off, 71 % of the labelled points were found without rows in their place, and 98 % with
+    black ones; the colour made no difference.
 
     Reductions to less than half are averaged over areas, because thin lane paint would otherwise fall between pixels.
 
@@ -94,7 +95,8 @@ def fit_photo(image: UInt8[np.ndarray, "h w 3"], camera: PhotoCamera | Placement
     if not height or not width:
         raise UserError(f"a photo of {width} x {height} pixels shows nothing: give another")
     seen = camera if isinstance(camera, Placement) else _seen(height, width, camera or PhotoCamera())
-    part = image[seen.top : seen.top + seen.height, seen.left : seen.left + seen.width]
+    part = image[max(seen.top, 0) : seen.top + seen.height, seen.left : seen.left + seen.width]
+    part = np.pad(part, ((max(-seen.top, 0), 0), (0, 0), (0, 0)))
     if seen.width > 2 * WIDTH or seen.height > 2 * HEIGHT:
         cv2 = opencv()
         fitted = cv2.resize(part, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA)
@@ -131,8 +133,7 @@ def _seen(height: int, width: int, camera: PhotoCamera) -> Placement:
         if camera.focal is not None:
             below = (1.0 - HORIZON) * columns * HEIGHT / WIDTH  # rows that TuSimple's camera sees under its horizon
             bottom = round(min(max(camera.horizon + below, 1), height))
-        top = round(max(camera.horizon - HORIZON / (1.0 - HORIZON) * (bottom - camera.horizon), 0))
-        top = min(top, bottom - 1)
+        top = min(round(camera.horizon - HORIZON / (1.0 - HORIZON) * (bottom - camera.horizon)), bottom - 1)
     return Placement(left, top, across, bottom - top)
 
 
@@ -143,14 +144,6 @@ def is_alike(width: int, height: int) -> bool:
 
 def misfits(view: Placement, horizon: float) -> list[str]:
     """Return what makes a view with a known horizon (row of the photo) unlike TuSimple's; empty if nothing does."""
-    found, at = [], (horizon - view.top) / view.height
-    if abs(at - HORIZON) > _LEVEL:
-        found.append(
-            f"the horizon is at {at:.2f} of the height that the network sees, in its training images at {HORIZON:.2f}: "
-            f"the photo has too few rows above row {horizon:g}"
-        )
-    if not is_alike(view.width, view.height):
-        found.append(
-            f"the network sees {view.width} x {view.height} pixels, distorted to 16:9: is row {horizon:g} the horizon?"
-        )
-    return found
+    if is_alike(view.width, view.height):
+        return []
+    return [f"the network sees {view.width} x {view.height} pixels, distorted to 16:9: is row {horizon:g} the horizon?"]

@@ -1,7 +1,8 @@
 """Whether lanes predicted in a part of a photo are plausible: they meet in one point, do not cross, and lie on paint.
 
-Nothing here was trained. Lengths are those of TuSimple's camera, 1.5 m above the road, because a part of a photo is
-good if the network sees in it what TuSimple's camera would have seen.
+Of many parts, that one is best whose lanes are also long, and predicted in the other parts as well. Nothing here was
+trained; what the choice was fitted to is said in docs/gtn_lane.md. Lengths are those of TuSimple's camera, 1.5 m above
+the road, because a part of a photo is good if the network sees in it what TuSimple's camera would have seen.
 """
 
 from __future__ import annotations
@@ -33,6 +34,8 @@ _SUPPORTED, _MORE = 0.18, 0.1
 _PARTS, _SPREAD, _SOME = 5, 3, 0.1
 # What a further lane is worth beside the paint under all lanes: worn paint hardly differs from asphalt.
 _LANE_WORTH = 0.1
+# Lanes of two views agree where they are closer than this fraction of the photo's width, in so many rows of the photo.
+_SAME, _ROWS = 0.02, 200
 # Columns of the view by which lanes must have changed places to count as crossed.
 _CROSSED = 0.005
 
@@ -43,7 +46,6 @@ class Judgement:
 
     Attributes:
         value: plausibility, from 0; TuSimple's frames have 0.2 to 1.5.
-        rank: the same where only lanes on paint count: of views of an unknown camera the highest is taken.
         meeting: column and row of the photo in which the lanes meet; None for fewer than two lanes.
         trust: weight of `meeting` in an estimate of the horizon.
         paint: of each lane, the fraction that lies on paint.
@@ -52,7 +54,6 @@ class Judgement:
     """
 
     value: float
-    rank: float
     meeting: tuple[float, float] | None
     trust: float
     paint: tuple[float, ...]
@@ -86,26 +87,77 @@ def judge_lanes(
         supported.append(on >= _SUPPORTED and on - beside >= _MORE and parts >= _SPREAD)
         clutter.append(beside)
         lines.append(np.polyfit(v, u, 1, w=v - HORIZON))
-        weights.append((float(score) * max(on - beside, 0.0), supported[-1]))
+        weights.append(float(score) * max(on - beside, 0.0))
     if len(lines) < 2:
-        return Judgement(0.0, 0.0, None, 0.0, tuple(paint), tuple(supported), crossed=False)
+        return Judgement(0.0, None, 0.0, tuple(paint), tuple(supported), crossed=False)
     slope, start = np.array(lines).T
     # The point (u, v) nearest to all lines u = start + slope v.
     system = np.stack([np.ones(len(slope)), -slope], 1)
     meeting = np.linalg.lstsq(system, start, rcond=None)[0]
     apart = float(np.abs(system @ meeting - start).max())
     near, far = start + slope, start + slope * (HORIZON + 0.08)
-    crossed = bool((np.diff(far[np.argsort(near)]) < -_CROSSED).any())
+    # Where straight lines through them do, or they themselves within their extents.
+    crossed = bool(
+        (np.diff(far[np.argsort(near)]) < -_CROSSED).any() or not without_crossings(lanes, scores.tolist(), 1.0).all()
+    )
     together = float(np.exp(-0.5 * (apart / _MEETING_SPREAD) ** 2))
     clean = max(1.0 - float(np.mean(clutter)) / _MOST_CLUTTER, 0.0)
     aligned = float(np.exp(-0.5 * ((meeting[1] - HORIZON) / _HORIZON_SPREAD) ** 2))
-    on_paint = [weight for weight, good in weights if good]
-    trust = together * clean * (sum(weight for weight, _ in weights) + _LANE_WORTH * (len(lines) - 1))
+    trust = together * clean * (sum(weights) + _LANE_WORTH * (len(lines) - 1))
     value = 0.0 if crossed else trust * aligned
-    fraction = len(on_paint) / len(supported)
-    rank = together * clean * aligned * fraction * (sum(on_paint) + _LANE_WORTH * max(len(on_paint) - 1, 0))
     column, row = map(float, view.to_photo(meeting))
-    return Judgement(value, 0.0 if crossed else rank, (column, row), trust, tuple(paint), tuple(supported), crossed)
+    return Judgement(value, (column, row), trust, tuple(paint), tuple(supported), crossed)
+
+
+def agreement(
+    lanes: Sequence[Float[np.ndarray, "p 2"]],
+    others: Sequence[Sequence[Float[np.ndarray, "q 2"]]],
+    values: Sequence[float],
+    size: tuple[int, int],
+) -> Float[np.ndarray, " l"]:
+    """Return how much of each lane other views of the photo show too: the mean over views, weighted by their values.
+
+    A view that the network was not made for bends and shifts what it finds in its own way, and the truth is what many
+    have in common.
+
+    Args:
+        lanes: of one view, (column, row) in pixels of the photo, rows ascending.
+        others: of each other view.
+        values: of the other views, see `Judgement`.
+        size: height and width of the photo.
+    """
+    rows = np.linspace(0, size[0] - 1, _ROWS)
+    mine = np.array([_columns(lane, rows) for lane in lanes]).reshape(-1, _ROWS)
+    extent = np.maximum(np.isfinite(mine).sum(1), 1)
+    found, total = np.zeros(len(lanes)), max(sum(values), 1e-9)
+    for view, value in zip(others, values, strict=True):
+        if view and value:
+            theirs = np.stack([_columns(lane, rows) for lane in view])
+            near = np.abs(theirs - mine[:, None]) < _SAME * size[1]
+            found += value / total * near.sum(-1).max(1) / extent
+    return found
+
+
+def plausibility(
+    value: float, agreed: Float[np.ndarray, " l"], lanes: Sequence[Float[np.ndarray, "p 2"]], height: int
+) -> float:
+    """Return how plausible one of many views of a photo is: of long lanes, on which other views agree.
+
+    Args:
+        value: of the view alone, see `Judgement`.
+        agreed: of each lane, see `agreement`.
+        lanes: (column, row) in pixels of the photo, rows ascending.
+        height: of the photo, pixels.
+    """
+    length = sum(float(np.ptp(lane[:, 1])) for lane in lanes if len(lane)) / height
+    return float(agreed.sum()) ** 0.5 * value**0.25 * length
+
+
+def _columns(lane: Float[np.ndarray, "p 2"], rows: Float[np.ndarray, " r"]) -> Float[np.ndarray, " r"]:
+    """Return the columns of a lane at rows, NaN beyond its ends."""
+    if not len(lane):
+        return np.full(rows.shape, np.nan)
+    return np.interp(rows, lane[:, 1], lane[:, 0], left=np.nan, right=np.nan)
 
 
 def common_horizon(judgements: Sequence[Judgement], height: int) -> tuple[float, float] | None:

@@ -2,7 +2,7 @@
 
 The network was trained on one camera, TuSimple's. Cutting sky off the top moves the horizon to its row, and cutting the
 sides gives a wide lens its field of view. With the right cut, the predicted lanes meet in one point on the horizon, do
-not cross, and lie on paint (`evaluation.photo_lanes`).
+not cross, lie on paint, reach far, and are those that most other cuts show (`evaluation.photo_lanes`).
 """
 
 from __future__ import annotations
@@ -12,10 +12,18 @@ from dataclasses import dataclass
 
 import jax
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 
 from tflane_jax.datasets.photos import FOCAL, HORIZON, PhotoCamera, Placement, fit_photo, is_alike, misfits
-from tflane_jax.evaluation.photo_lanes import Judgement, common_horizon, is_blank, judge_lanes, without_crossings
+from tflane_jax.evaluation.photo_lanes import (
+    Judgement,
+    agreement,
+    common_horizon,
+    is_blank,
+    judge_lanes,
+    plausibility,
+    without_crossings,
+)
 from tflane_jax.evaluation.predict import Predictor
 from tflane_jax.files.images import opencv
 from tflane_jax.geometry.cameras import inside_image
@@ -28,9 +36,14 @@ from tflane_jax.tasks.lane_shape import predict_curves
 _HORIZONS = (0.3, 0.36, 0.42, 0.48, 0.54, 0.6)
 _WIDTHS = (1.0, 0.75, 0.55)
 _FINE_WIDTHS = (1.0, 0.85, 0.7, 0.55)
-# The value from which a whole photo is taken without a search (TuSimple's ten frames at hand have 0.23 up), and the
-# ranks from which a view is taken without a warning, and taken at all.
-_SURE, _PLAUSIBLE, _LEAST = 0.2, 0.15, 0.05
+# The value from which a whole photo is taken without a search: TuSimple's ten frames at hand have 0.23 up.
+_SURE = 0.2
+# From which plausibility a view is taken at all, and without a warning: one of many (`plausibility`), and one that is
+# given (value of `Judgement`).
+_OF_MANY, _GIVEN = (0.72, 0.9), (0.05, 0.15)
+# Views are judged by lanes of this score, whatever lanes are asked for. Of a view that was searched, lanes count that
+# lie on paint or that other views show to this extent; one of them must have such a fraction of it on paint.
+_JUDGED_SCORE, _AGREED, _PAINTED = 0.5, 0.2, 0.1
 _POINTS = 100
 _EMPTY = "the photo is empty: it has one brightness almost everywhere"
 _NOTHING = (
@@ -48,7 +61,7 @@ class PhotoLanes:
         lanes: (column, row) in pixels of the photo, from the upper to the lower end; from left to right.
         scores: of the lanes, 0 to 1.
         paint: fraction of each lane that lies on paint.
-        value: plausibility of the view, see `Judgement`.
+        value: plausibility of the view: of one of many `plausibility`, otherwise that of `Judgement`.
         warning: what is doubtful; "" if nothing is.
     """
 
@@ -62,12 +75,38 @@ class PhotoLanes:
 
 @dataclass(frozen=True)
 class _ViewLanes:
-    """Lanes that the network finds in a view, fractions of the view, and how plausible they are."""
+    """Lanes that the network finds in a view, and how plausible they are.
+
+    Attributes:
+        view: the part of the photo.
+        lanes: (u, v), fractions of the view.
+        points: the same below the view's horizon and inside the photo, pixels.
+        scores: of the lanes.
+        judged: of this view alone.
+    """
 
     view: Placement
     lanes: list[Float[np.ndarray, "p 2"]]
+    points: list[Float[np.ndarray, "p 2"]]
     scores: Float[np.ndarray, " l"]
     judged: Judgement
+
+
+@dataclass(frozen=True)
+class _Choice:
+    """The view that is taken, and whether to believe it.
+
+    Attributes:
+        seen: its lanes.
+        value: its plausibility.
+        bounds: from which value it is taken at all, and without a warning.
+        believed: which lanes are.
+    """
+
+    seen: _ViewLanes
+    value: float
+    bounds: tuple[float, float]
+    believed: Bool[np.ndarray, " l"]
 
 
 class PhotoReader:
@@ -94,7 +133,8 @@ class PhotoReader:
             view = fit_photo(photo, camera).placement
             return PhotoLanes(view, (), (), (), 0.0, _EMPTY)
         if camera is not None and camera.horizon is not None:
-            return self._checked(photo, self._of_camera(photo, grey, camera), camera.horizon)
+            seen = self._in_view(photo, grey, fit_photo(photo, camera).placement)
+            return self._checked(photo, self._given(photo, grey, seen, least=0.0), camera.horizon)
         return self._checked(photo, self._search(photo, grey, None if camera is None else camera.focal))
 
     def find_view(self, photos: Iterable[UInt8[np.ndarray, "h w 3"]], focal: float | None = None) -> Placement | None:
@@ -107,25 +147,25 @@ class PhotoReader:
         found = []
         for photo in photos:
             if not is_blank(grey := _grey(photo)):
-                seen = self._search(photo, grey, focal)
-                found.append((_worth(seen, photo), seen.view))
-        worth, view = max(found, key=lambda one: one[0], default=(0.0, None))
-        return None if worth < _LEAST else view
+                found.append(self._search(photo, grey, focal))
+        # How much it is above what is asked of it: a whole frame may have been taken without a search.
+        best = max(found, key=lambda choice: choice.value / choice.bounds[0], default=None)
+        return None if best is None or best.value < best.bounds[0] else best.seen.view
 
     def read_view(self, photo: UInt8[np.ndarray, "h w 3"], view: Placement) -> PhotoLanes:
         """Return the lanes in a view that `find_view` found in other frames of the camera."""
         grey = _grey(photo)
         if is_blank(grey):
             return PhotoLanes(view, (), (), (), 0.0, _EMPTY)
-        return self._checked(photo, self._in_view(photo, grey, view))
+        return self._checked(photo, self._given(photo, grey, self._in_view(photo, grey, view)))
 
     def _search(
         self, photo: UInt8[np.ndarray, "h w 3"], grey: UInt8[np.ndarray, "h w"], focal: float | None
-    ) -> _ViewLanes:
+    ) -> _Choice:
         height, width = grey.shape
-        whole = self._of_camera(photo, grey, PhotoCamera(focal))
+        whole = self._in_view(photo, grey, fit_photo(photo, PhotoCamera(focal)).placement)
         if whole.judged.value >= _SURE and is_alike(width, height):
-            return whole
+            return self._given(photo, grey, whole)
         tried = {whole.view: whole}
         for horizon in _HORIZONS:
             self._try(tried, photo, grey, PhotoCamera(focal, horizon * height))
@@ -138,7 +178,10 @@ class PhotoReader:
             for one in [FOCAL * width * part for part in _FINE_WIDTHS] if focal is None else [focal]:
                 for column in (None, ahead):
                     self._try(tried, photo, grey, PhotoCamera(one, meeting[1], column))
-        return max(tried.values(), key=lambda seen: seen.judged.rank)
+        value, best = max(((_rated(one, tried, photo), one) for one in tried.values()), key=lambda pair: pair[0])
+        seen = self._asked(photo, grey, best)
+        believed = (_agreed(seen, tried, photo) >= _AGREED) | np.array(seen.judged.supported, bool)
+        return _Choice(seen, value, _OF_MANY, believed)
 
     def _try(self, tried: dict[Placement, _ViewLanes], photo, grey, camera: PhotoCamera) -> None:
         if camera.horizon is not None and camera.horizon <= 1.0:
@@ -147,10 +190,16 @@ class PhotoReader:
         if view not in tried:
             tried[view] = self._in_view(photo, grey, view)
 
-    def _of_camera(self, photo, grey, camera: PhotoCamera) -> _ViewLanes:
-        return self._in_view(photo, grey, fit_photo(photo, camera).placement)
+    def _given(self, photo, grey, seen: _ViewLanes, least: float = _GIVEN[0]) -> _Choice:
+        """Return the choice of a view without alternatives, all of whose lanes are believed."""
+        asked = self._asked(photo, grey, seen)
+        return _Choice(asked, seen.judged.value, (least, _GIVEN[1]), np.ones(len(asked.lanes), bool))
 
-    def _in_view(self, photo, grey, view: Placement) -> _ViewLanes:
+    def _asked(self, photo, grey, seen: _ViewLanes) -> _ViewLanes:
+        """Return the lanes of a view by the reader's threshold, which has no influence on how views are judged."""
+        return seen if self.threshold == _JUDGED_SCORE else self._in_view(photo, grey, seen.view, self.threshold)
+
+    def _in_view(self, photo, grey, view: Placement, threshold: float = _JUDGED_SCORE) -> _ViewLanes:
         fitted = fit_photo(photo, view)
         example = RoadImage(fitted.image, fitted.image_valid, LaneLines.empty(1, 1))
         stacked = jax.tree.map(lambda leaf: np.asarray(leaf)[None], example)
@@ -158,35 +207,35 @@ class PhotoReader:
         scores = np.asarray(answer.scores)
         curves = np.asarray(answer.curves, np.float64)
         # A lane that would end above its beginning has no points, as in TuSimple's metric.
-        chosen = np.flatnonzero((scores >= self.threshold) & (curves[:, 1] > curves[:, 0]))
+        chosen = np.flatnonzero((scores >= threshold) & (curves[:, 1] > curves[:, 0]))
         curves = curves[chosen]
         rows = np.linspace(curves[:, 0], curves[:, 1], _POINTS, axis=-1)
         lanes = np.stack([curve_columns(curves[:, 2:], rows), rows], -1)
         order = np.argsort(lanes[:, -1, 0], kind="stable")
         lanes, scores = list(lanes[order]), scores[chosen][order]
-        return _ViewLanes(view, lanes, scores, judge_lanes(grey, view, lanes, scores))
+        points = [_inside(view.to_photo(lane), grey.shape, view.top + HORIZON * view.height) for lane in lanes]
+        return _ViewLanes(view, lanes, points, scores, judge_lanes(grey, view, lanes, scores))
 
-    def _checked(self, photo: UInt8[np.ndarray, "h w 3"], seen: _ViewLanes, horizon: float | None = None) -> PhotoLanes:
+    def _checked(self, photo: UInt8[np.ndarray, "h w 3"], choice: _Choice, horizon: float | None = None) -> PhotoLanes:
         """Return what is plausible, in pixels of the photo: below the horizon, inside, not crossing.
 
-        Without a known `horizon` (row) the view was searched, and may show nothing that is plausible.
+        Args:
+            photo: the photo.
+            choice: the view.
+            horizon: of a known camera, row.
         """
-        judged, (height, width) = seen.judged, photo.shape[:2]
-        searched = horizon is None and not _is_whole(seen.view, photo)
-        worth_of_view = judged.value if horizon is not None else _worth(seen, photo)
-        if horizon is None and worth_of_view < _LEAST:
-            return PhotoLanes(seen.view, (), (), (), judged.value, _NOTHING)
+        seen, judged, (least, plausible) = choice.seen, choice.seen.judged, choice.bounds
+        if choice.value < least:
+            return PhotoLanes(seen.view, (), (), (), choice.value, _NOTHING)
         # Lanes meet above their view's horizon where the road rises. Those of a known camera may be nearly parallel and
         # meet anywhere.
         top = seen.view.top + HORIZON * seen.view.height if horizon is None else horizon
         if horizon is None and judged.meeting is not None and not judged.crossed:
             top = min(top, judged.meeting[1])
         lanes, worth, kept = [], [], []
-        believed = [i for i in range(len(seen.lanes)) if not searched or judged.supported[i]]
+        believed = np.flatnonzero(choice.believed)
         for i in believed:
-            lane = seen.lanes[i]
-            points = seen.view.to_photo(lane)
-            points = points[inside_image(points, width, height) & (points[:, 1] >= top)]
+            points = _inside(seen.view.to_photo(seen.lanes[i]), photo.shape, top)
             if len(points) > 1:
                 lanes.append(points)
                 worth.append(float(seen.scores[i]) + judged.paint[i])
@@ -199,7 +248,7 @@ class PhotoReader:
             warnings.append(f"lanes that cross others are left out ({int((~clear).sum())})")
         if judged.crossed and clear.all():
             warnings.append("the lanes would cross before the horizon")
-        if seen.lanes and worth_of_view < _PLAUSIBLE and not judged.crossed:
+        if seen.lanes and choice.value < plausible and not judged.crossed:
             warnings.append("the lanes hardly lie on paint or do not meet on the horizon: look at the picture")
         shown = [k for k, keep in zip(range(len(lanes)), clear, strict=True) if keep]
         return PhotoLanes(
@@ -207,18 +256,28 @@ class PhotoReader:
             tuple(lanes[k] for k in shown),
             tuple(float(seen.scores[kept[k]]) for k in shown),
             tuple(judged.paint[kept[k]] for k in shown),
-            judged.value,
+            choice.value,
             "; ".join(warnings),
         )
 
 
-def _worth(seen: _ViewLanes, photo: UInt8[np.ndarray, "h w 3"]) -> float:
-    """Return the plausibility of a view: of a searched one, only lanes on paint count."""
-    return seen.judged.value if _is_whole(seen.view, photo) else seen.judged.rank
+def _rated(one: _ViewLanes, tried: dict[Placement, _ViewLanes], photo: UInt8[np.ndarray, "h w 3"]) -> float:
+    """Return the plausibility of one of many views; 0 where none of its lanes lies on paint."""
+    if max(one.judged.paint, default=0.0) < _PAINTED:
+        return 0.0
+    return plausibility(one.judged.value, _agreed(one, tried, photo), one.points, photo.shape[0])
 
 
-def _is_whole(view: Placement, photo: UInt8[np.ndarray, "h w 3"]) -> bool:
-    return view == fit_photo(photo).placement
+def _agreed(one: _ViewLanes, tried: dict[Placement, _ViewLanes], photo: UInt8[np.ndarray, "h w 3"]) -> np.ndarray:
+    """Return how much of each lane the other views show."""
+    others = [other for view, other in tried.items() if view != one.view]
+    values = [other.judged.value for other in others]
+    return agreement(one.points, [other.points for other in others], values, photo.shape[:2])
+
+
+def _inside(points: Float[np.ndarray, "p 2"], shape: tuple[int, ...], top: float) -> Float[np.ndarray, "q 2"]:
+    """Return the points (column, row) in a photo of this shape and not above row `top`."""
+    return points[inside_image(points, shape[1], shape[0]) & (points[:, 1] >= top)]
 
 
 def _grey(photo: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w"]:

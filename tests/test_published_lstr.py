@@ -57,8 +57,9 @@ def test_photos_of_three_cameras_give_plausible_lanes_without_hints(tmp_path):
         apart = np.diff(sorted((columns(lane, rows) for lane in lanes), key=lambda c: c[-1]), axis=0)
         assert (apart > 0).all(), name
         assert (apart[:, 0] < 0.2 * apart[:, -1]).all(), name
-        at_horizon = [float(columns(lane, np.array([horizon]))[0]) for lane in lanes]
-        assert np.ptp(at_horizon) < 0.08 * width, name
+        # Behind the rear camera the road rises: its lines meet below the horizon.
+        near_horizon = [float(columns(lane, np.array([horizon + 40]))[0]) for lane in lanes]
+        assert np.ptp(near_horizon) < 0.08 * width, name
 
 
 @pytest.mark.parametrize("name", [*list(photo_views.FRAMES)[1:], *photo_views.STREET])

@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import pickle
 import re
 from pathlib import Path
 
@@ -211,11 +212,20 @@ def test_nuscenes_samples_name_the_scenes_of_maptr(folder, tmp_path, capsys):
         ({"s0": "\ud800"}, r"s0 has the scene '\\ud800', expected a text"),
         ([*table, {"token": "s0", "scene_token": "b"}], "row 3 has the scene 'b', another row 'a': name one"),
         ([{"token": "s0"}], "row 0 lacks the entry 'scene_token'"),
+        ({"s1\n": 1}, r"'s1\\n' has the scene 1"),
         (7, "is of type int, expected a list"),
     ):
         scenes.write_text(json.dumps(content))
         with pytest.raises(UserError, match=message):
             run(valid(folder), folder, scenes=scenes)
+
+
+@pytest.mark.parametrize("content", [{10**5000: "a"}, [{"token": 10**5000, "scene_token": "a"}]])
+def test_scenes_of_a_pickle_with_a_huge_number_are_refused(folder, tmp_path, content):
+    scenes = tmp_path / "scenes.pkl"
+    scenes.write_bytes(pickle.dumps(content))
+    with pytest.raises(UserError, match=r"scenes.pkl.*: the frame an integer of many digits is no name"):
+        run(valid(folder), folder, scenes=scenes)
 
 
 @pytest.mark.parametrize("protocol", ["maptr", "maptrv2", "maptr-iou", "maptrv2-iou"])

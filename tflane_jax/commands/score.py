@@ -10,6 +10,7 @@ from typing import Any
 
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import check_stem
+from tflane_jax.files.wording import named
 from tflane_jax.metrics.groups import shown_of_part
 from tflane_jax.plots.tables import format_table, save_table, written_to
 from tflane_jax.scoring import remarks as about
@@ -45,7 +46,7 @@ def run(options: argparse.Namespace) -> int:
         print(f"tflane: {remark}", file=sys.stderr)
     rows = _rows(scored, options.bootstrap)
     if options.by == "scene":
-        rows += [{"part": name, **values} for name, values in scored.by_scene(protocol.of_scene).items()]
+        rows += [{"part": named(name), **values} for name, values in scored.by_scene(protocol.of_scene).items()]
     rows += [{"part": group} | shown_of_part(values) for group, values in (groups or {}).items() if group != "all"]
 
     title = f"{options.predictions.name}: {scored.protocol}"

@@ -12,7 +12,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from tflane_jax.errors import UserError
-from tflane_jax.files.fields import is_text, items, line_points, member, numbers, shown, whole_number
+from tflane_jax.files.fields import is_name, items, line_points, member, numbers, whole_number
+from tflane_jax.files.wording import shown
 
 ATTRIBUTES = 13
 """Attributes of traffic elements, 0 (unknown) to 12."""
@@ -94,12 +95,8 @@ def read_areas(record: Any, where: str) -> tuple[list[Float[np.ndarray, "_ 3"]],
 def as_identifier(identifier: Any, where: str) -> FrameKey:
     """Return a key of a collected file as a frame; raises UserError if it is none."""
     named = isinstance(identifier, tuple) and len(identifier) == 3
-    if not named or not all(map(_is_name, identifier)):
-        expected = "expected (split, segment, timestamp) as texts or numbers"
+    # A frame's name is its parts with "/" between them.
+    if not named or not all(is_name(part) and "/" not in str(part) for part in identifier):
+        expected = "expected (split, segment, timestamp) as texts or numbers, without '/' in them"
         raise UserError(f"{where}: the key {shown(identifier)} is no frame, {expected}")
     return FrameKey(*map(str, identifier))
-
-
-def _is_name(part: Any) -> bool:
-    # Python refuses to write integers of more than 4300 digits.
-    return is_text(part) or (isinstance(part, (int, np.integer)) and abs(int(part)) < 2**64)

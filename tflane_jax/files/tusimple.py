@@ -5,7 +5,6 @@ Format: README of github.com/TuSimple/tusimple-benchmark, doc/lane_detection.
 
 from __future__ import annotations
 
-import reprlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from jaxtyping import Float
 
 from tflane_jax.errors import UserError
 from tflane_jax.files.fields import is_text, items, member, numbers, parse_json, read_text
+from tflane_jax.files.wording import named, shown
 
 NO_POINT = -2.0
 """x of a row in which a lane has no point."""
@@ -76,11 +76,11 @@ def _records(path: Path) -> list[tuple[str, Any, str]]:
         record = parse_json(line.strip(), where, "JSON record", once=True)
         name = member(record, "raw_file", where)
         if not is_text(name) or not name:
-            raise UserError(f"{where}: raw_file is {reprlib.repr(name)}, expected the path of an image")
+            raise UserError(f"{where}: raw_file is {shown(name)}, expected the path of an image")
         if name in first:
-            raise UserError(f"{where}: {name} is there twice, first in line {first[name]}")
+            raise UserError(f"{where}: {named(name)} is there twice, first in line {first[name]}")
         first[name] = number
-        records.append((name, record, f"{where} ({name})"))
+        records.append((name, record, f"{where} ({named(name)})"))
     return records
 
 

@@ -17,7 +17,8 @@ import numpy as np
 
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import replacing
-from tflane_jax.files.fields import is_text, items, load_file, member, numbers, scores, shown, whole_number
+from tflane_jax.files.fields import is_text, items, load_file, member, numbers, scores, whole_number
+from tflane_jax.files.wording import named, shown
 from tflane_jax.metrics.map_matching import LINE_CLASSES, Dims, MapDetections, MapTruth
 
 # Metres from the vehicle: no line of a local map is so far away.
@@ -87,7 +88,7 @@ def _samples(path: Path, field: str) -> list[tuple[str, Any, str]]:
         token = member(record, "sample_token", f"{path}: {field}[{i}]")
         if not is_text(token) or not token:
             raise UserError(f"{path}: {field}[{i}].sample_token is {shown(token)}, expected a text")
-        where = f"{path}, sample {token}"
+        where = f"{path}, sample {named(token)}"
         if token in seen:
             raise UserError(f"{where} is there twice")
         seen.add(token)

@@ -17,7 +17,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from tflane_jax.errors import UserError
-from tflane_jax.files.fields import choices, fractions, items, load_file, member, scores, shown
+from tflane_jax.files.fields import choices, fractions, items, load_file, member, scores
 from tflane_jax.files.openlane import (
     CENTERLINE,
     DENSE_POINTS,
@@ -30,6 +30,7 @@ from tflane_jax.files.openlane import (
     read_labels,
     read_lines,
 )
+from tflane_jax.files.wording import named, shown
 from tflane_jax.geometry.polylines import resample
 from tflane_jax.metrics.frames import ElementDetections, ElementTruth, LaneDetections, LaneTruth
 from tflane_jax.metrics.lane_segment import Flavour
@@ -116,7 +117,7 @@ def _annotations(
         segment = file.parent.parent
         key = FrameKey(segment.parent.name, segment.name, stem)
         if key in origin:
-            raise UserError(f"{path}: frame {key} is there twice: {origin[key]} and {file}")
+            raise UserError(f"{path}: frame {named(key)} is there twice: {origin[key]} and {file}")
         origin[key] = file
         frames[key] = parse(member(load_file(file), "annotation", str(file)), str(file))
     return frames
@@ -136,7 +137,7 @@ def _by_frame(records: Mapping[Any, Any], field: str, path: Path, parse: _Parse[
     frames = {}
     for identifier, record in records.items():
         key = as_identifier(identifier, str(path))
-        where = f"{path}, frame {key}"
+        where = f"{path}, frame {named(key)}"
         if key in frames:
             raise UserError(f"{where} is there twice: once with numbers in its name, once with texts")
         frames[key] = parse(member(record, field, where), where)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from tflane_jax.files.tusimple import ROWS, RowLanes
+from tflane_jax.files.wording import named
 from tflane_jax.metrics.frames import LaneDetections, LaneTruth, Lines
 from tflane_jax.metrics.map_matching import MapDetections, MapTruth
 from tflane_jax.metrics.segment_matching import SegmentDetections, SegmentTruth
@@ -115,7 +116,7 @@ def _other_counts(what: str, frames: Mapping[Any, Lines], count: int) -> list[st
     """Return a remark on lines that have not the official number of points, which the distances presuppose."""
     total = sum(map(len, frames.values()))
     other = [
-        f"frame {key}, number {i}: {len(line)}"
+        f"frame {named(key)}, number {i}: {len(line)}"
         for key, lines in frames.items()
         for i, line in enumerate(lines)
         if len(line) != count
@@ -146,4 +147,4 @@ def _extent(frames: Iterable[Lines]) -> float | None:
 
 
 def _named(names: Sequence[Any]) -> str:
-    return ", ".join(map(str, names[:_NAMED])) + (", ..." if len(names) > _NAMED else "")
+    return ", ".join(map(named, names[:_NAMED])) + (", ..." if len(names) > _NAMED else "")

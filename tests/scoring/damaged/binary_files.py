@@ -50,6 +50,8 @@ def _openlane(form, lanes, line, lane_lane, lane_element):
             ("frame is a list", put(*top, KEYS[1], []), f"{where} is of type list, expected a mapping"),
             ("key is text", _rename(top, "val/10000/150"), "'val/10000/150' is no frame, expected"),
             ("key of two", _rename(top, ("val", "10000")), r"\('val', '10000'\) is no frame"),
+            ("key of a path", _rename(top, ("./val", "10000", "150")), r"'150'\) is no frame, expected .* without '/'"),
+            ("key with codes", _rename(top, ("val\x1b[31m\n", "10000", "150")), r"'val\\x1b\[31m\\n/10000/150'"),
             ("key of nothing", _rename(top, ("val", "10000", None)), "is no frame, expected .*as texts or numbers"),
             ("key of a huge number", _rename(top, ("val", "10000", LONGEST)), "is no frame, expected"),
             ("key of half a character", _rename(top, ("val", "\ud800", "150")), r"'\\ud800', '150'\) is no frame"),
@@ -208,7 +210,7 @@ def _pickles():
             ("not a pickle", lambda b: b"{'results': {}}", "no pickle file, or it is damaged"),
             ("code", lambda b: pickle.dumps(Evil()), "is refused: it is a pickle that names"),
             ("a list", lambda b: pickle.dumps([1, 2]), "is of type list, expected a mapping"),
-            ("no frames", lambda b: pickle.dumps({"results": {}}), "frame|looks like|no frames"),
+            ("no frames", lambda b: pickle.dumps({"results": {}}), "frame|looks like|empty: it has no frames"),
             ("nested too deep", lambda b: deep_pickle, "is of type list, expected a mapping"),
         ):
             yield Case("centerline", side, name, message, after=after)

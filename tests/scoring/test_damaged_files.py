@@ -220,6 +220,13 @@ def test_nuscenes_samples_name_the_scenes_of_maptr(folder, tmp_path, capsys):
             run(valid(folder), folder, scenes=scenes)
 
 
+def test_a_scene_with_codes_is_quoted_in_the_table(folder, tmp_path, capsys):
+    scenes = tmp_path / "scenes.json"
+    scenes.write_text(json.dumps({"s0": "a\x1b[2J", "s1": "b", "s2": "b"}))
+    assert run(valid(folder), folder, by="scene", scenes=scenes) == 0
+    assert "| 'a\\x1b[2J' |" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize("content", [{10**5000: "a"}, [{"token": 10**5000, "scene_token": "a"}]])
 def test_scenes_of_a_pickle_with_a_huge_number_are_refused(folder, tmp_path, content):
     scenes = tmp_path / "scenes.pkl"

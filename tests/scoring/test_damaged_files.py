@@ -93,6 +93,18 @@ def _scaled(factor):
     return change
 
 
+def _boxed(side, change):
+    """Return the change of the boxes of all traffic elements."""
+
+    def changed(content):
+        frames = content["results"] if side == "predictions" else content
+        for frame in frames.values():
+            for element in frame["predictions" if side == "predictions" else "annotation"]["traffic_element"]:
+                element["points"] = change(element["points"])
+
+    return changed
+
+
 REMARKS = {
     "dense centerlines": (
         Case("centerline", "predictions", "", "", _resampled(201)),
@@ -110,6 +122,19 @@ REMARKS = {
         Case("maptr", "predictions", "", "", _scaled(1 / 60)),
         r"predicted lines reach 0.15 from the origin, true ones 9 .*: are the predictions normalised",
     ),
+    **{
+        f"boxes of {form} {side} that {fault}": (
+            Case(form, side, "", "", _boxed(side, change)),
+            f"all 3 boxes of {'predicted' if side == 'predictions' else 'true'} traffic elements {fault}: are",
+        )
+        for form in ("centerline", "segment")
+        for side in ("predictions", "truth")
+        for fault, change in (
+            ("lie between 0 and 1, as if normalised", lambda box: box / 1550),
+            ("have no area", lambda box: box[:1] + 0 * box),
+            ("lie left of the image or above it", lambda box: box - 20),
+        )
+    },
     "rows of another camera": (
         Case("tusimple", "truth", "", "", put(0, "h_samples", [245, 255, 265, 275])),
         r"1 of 3 frames are labelled at other rows than TuSimple's.*\(clips/0313/0/20.jpg\)",

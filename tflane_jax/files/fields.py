@@ -16,7 +16,7 @@ import numpy as np
 
 from tflane_jax.errors import UserError
 from tflane_jax.files.plain_pickle import load_plain_pickle
-from tflane_jax.files.wording import digits, kind, shown
+from tflane_jax.files.wording import digits, kind, place, shape_text, shown
 
 _SPACE = re.compile(r"[ \t\n\r]*")
 PICKLE_SUFFIXES = (".pkl", ".pickle")
@@ -153,18 +153,18 @@ def numbers(value: Any, shape: tuple[int | None, ...], where: str, *, largest: f
     if array.size == 0 and not all(shape):
         array = array.reshape([size or 0 for size in shape])
     if array.ndim != len(shape) or any(n is not None and n != m for n, m in zip(shape, array.shape, strict=True)):
-        raise UserError(f"{where} has shape {array.shape}, expected {_shape(shape)}")
+        raise UserError(f"{where} has shape {array.shape}, expected {shape_text(shape)}")
     if not np.isfinite(array).all():
         index = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
-        raise UserError(f"{where} holds {array[index]}{_at(index)}: numbers must be finite")
+        raise UserError(f"{where} holds {array[index]}{place(index)}: numbers must be finite")
     if (np.abs(array) > largest).any():
         index = tuple(int(i) for i in np.argwhere(np.abs(array) > largest)[0])
-        raise UserError(f"{where} holds {array[index]:g}{_at(index)}: beyond {largest:g} in size")
+        raise UserError(f"{where} holds {array[index]:g}{place(index)}: beyond {largest:g} in size")
     return array
 
 
 def _as_array(value: Any, shape: tuple[int | None, ...], where: str) -> np.ndarray:
-    expected = f"expected numbers of shape {_shape(shape)}"
+    expected = f"expected numbers of shape {shape_text(shape)}"
     if value is None:
         raise UserError(f"{where} is {kind(value)}, {expected}")
     _check_size(value, shape, where)
@@ -209,7 +209,7 @@ def _check_size(value: Any, shape: tuple[int | None, ...], where: str) -> None:
         level = list(itertools.chain.from_iterable(rows))
     raise UserError(
         f"{where} holds more than {_MOST} numbers, or lists nested more than {_DEEPEST} deep, expected numbers of "
-        f"shape {_shape(shape)}"
+        f"shape {shape_text(shape)}"
     )
 
 
@@ -241,14 +241,15 @@ def _ragged(value: Any) -> str | None:
     return f"expected numbers, and rows of one length: row 0 is {sizes[0]}, row {other} {sizes[other]}"
 
 
-def line_points(value: Any, where: str) -> np.ndarray:
-    """Return a line's points (n, 3), metres in the vehicle's frame, n >= 1."""
+def line_points(value: Any, where: str, least: int = 1) -> np.ndarray:
+    """Return a line's points (n, 3), metres in the vehicle's frame, n of at least `least`."""
     points = numbers(value, (None, 3), where)
-    if len(points) == 0:
-        raise UserError(f"{where} is empty: a line has at least one point")
+    if len(points) < least:
+        has = "has one point" if len(points) else "is empty"
+        raise UserError(f"{where} {has}: a line has at least {'one point' if least == 1 else f'{least} points'}")
     if (far := np.abs(points) > _FARTHEST).any():
         index = tuple(int(i) for i in np.argwhere(far)[0])
-        raise UserError(f"{where} holds {points[index]:g}{_at(index)}: expected metres from the vehicle, not a map's")
+        raise UserError(f"{where} holds {points[index]:g}{place(index)}: expected metres from the vehicle, not a map's")
     return points
 
 
@@ -281,7 +282,7 @@ def choices(value: Any, shape: tuple[int | None, ...], where: str) -> np.ndarray
     array = numbers(_as_integers(value, shape, where), shape, where)
     if (other := (array != 0) & (array != 1)).any():
         index = tuple(int(i) for i in np.argwhere(other)[0])
-        raise UserError(f"{where} holds {digits(array[index])}{_at(index)}, expected 0 or 1")
+        raise UserError(f"{where} holds {digits(array[index])}{place(index)}, expected 0 or 1")
     return array == 1
 
 
@@ -344,11 +345,3 @@ def whole_number(value: Any, low: int, high: int, where: str) -> int:
     if not _is_number(value) or not low <= value <= high or value != int(value):
         raise UserError(f"{where} is {shown(value)}, expected a whole number from {low} to {high}")
     return int(value)
-
-
-def _at(index: tuple[int, ...]) -> str:
-    return f" at {list(index)}" if index else ""
-
-
-def _shape(shape: tuple[int | None, ...]) -> str:
-    return "(" + ", ".join("any" if size is None else str(size) for size in shape) + ("," * (len(shape) == 1)) + ")"

@@ -29,6 +29,16 @@ def kind(value: Any) -> str:
     return "missing (null)" if value is None else f"of type {type(value).__name__}"
 
 
+def place(index: tuple[int, ...]) -> str:
+    """Return where an array holds a number, as the end of a sentence; "" for an array that is one number."""
+    return f" at {list(index)}" if index else ""
+
+
+def shape_text(shape: tuple[int | None, ...]) -> str:
+    """Return an expected shape; None is any size."""
+    return "(" + ", ".join("any" if size is None else str(size) for size in shape) + ("," * (len(shape) == 1)) + ")"
+
+
 def named(name: Any) -> str:
     """Return the name of a frame, scene or image; in quotes where it has line breaks, escape codes or outer spaces."""
     text = str(name)

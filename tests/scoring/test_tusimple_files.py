@@ -62,6 +62,12 @@ def test_real_labels_against_themselves(tmp_path):
     assert (row["frames"], row["FP"], row["FN"]) == (len(labels), 0.0, 0.0)
 
 
+def test_labels_without_a_point_may_be_there_twice(tmp_path):
+    """The official labels have such images."""
+    truth = [record | {"lanes": [record["lanes"][0], [-2] * 4, [-2] * 4]} for record in TRUTH]
+    assert run(tmp_path, GUESS, truth)[1]["FP"] == 0.0
+
+
 def test_slow_images_are_remarked(tmp_path, capsys):
     slow = [record | {"run_time": 300} for record in GUESS]
     assert run(tmp_path, slow)[1]["FN"] == 1.0

@@ -63,6 +63,21 @@ def read_truth(path: Path) -> dict[str, RowLanes]:
     return found
 
 
+def read_truth_once(path: Path) -> dict[str, RowLanes]:
+    """Return the labelled lanes as `read_truth`; raises UserError also for a lane that an image has twice.
+
+    One prediction would match both, and FP would be negative. Lanes without a point are exempt: the official labels
+    have images with several.
+    """
+    found = read_truth(path)
+    for one in found.values():
+        first: dict[bytes, int] = {}
+        for i, x in enumerate(one.x):
+            if (x >= 0.0).any() and first.setdefault(x.tobytes(), i) != i:
+                raise UserError(f"{one.place}: lanes[{i}] is lanes[{first[x.tobytes()]}] once more: keep one of them")
+    return found
+
+
 def _records(path: Path) -> list[tuple[str, Any, str]]:
     """Return image, record and place of every line."""
     text = read_text(path, "file of JSON lines")

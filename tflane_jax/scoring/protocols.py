@@ -151,7 +151,7 @@ def _maptr(sampling: Sampling, measure: Measure = "chamfer", dims: Dims = 2) -> 
 def _tusimple(time_limit: float) -> ScoringProtocol:
     return ScoringProtocol(
         read_predictions=tusimple.read_predictions,
-        read_truth=tusimple.read_truth,
+        read_truth=tusimple.read_truth_once,
         scene_of=lambda image: image.rpartition("/")[0],
         no_scenes=tusimple.NO_DRIVES,
         metrics=partial(TuSimpleMetrics, time_limit),

@@ -88,6 +88,8 @@ def _tusimple():
     ):
         damage = drop(1, "h_samples") if rows is ... else put(1, "h_samples", rows)
         yield Case("tusimple", "truth", f"rows are {name}", f"truth.json, line 2 .*{message}", damage)
+    same = r"truth.json, line 2 .*: lanes\[2\] is lanes\[1\] once more: keep one of them"
+    yield Case("tusimple", "truth", "a lane twice", same, repeat(1, "lanes", 1))
     shifted = r"line 2 .*: h_samples are 250 to 280, those of the truth 240 to 270"
     yield Case("tusimple", "predictions", "shifted rows", shifted, put(1, "h_samples", [250, 260, 270, 280]))
     none = r"line 2 .*: h_samples are empty, those of the truth 240 to 270"
@@ -183,6 +185,8 @@ def _maptr():
     yield Case("maptr", "predictions", "no score", r"vectors\[1\] lacks the entry 'confidence_level'", drop(*level))
     one = put("GTs", 1, "vectors", 0, "pts", [[0.0, 0.0]])
     yield Case("maptr", "truth", "a line of one point", r"pts has shape \(1, 2\), expected .* at least 2", one)
+    same = r"truth.json, sample s1: vectors\[2\] is vectors\[0\] once more: keep one of them"
+    yield Case("maptr", "truth", "a line twice", same, repeat("GTs", 1, "vectors", 0))
     seen = put("GTs", 1, "vectors", 0, "visibility", 0.5)
     yield Case("maptr", "truth", "visibility of one line", r"vectors\[1\] lacks the entry 'visibility'", seen)
 

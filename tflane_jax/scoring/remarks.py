@@ -13,6 +13,7 @@ from tflane_jax.metrics.frames import ElementDetections, ElementTruth, LaneDetec
 from tflane_jax.metrics.map_matching import MapDetections, MapTruth
 from tflane_jax.metrics.segment_matching import SegmentDetections, SegmentTruth
 from tflane_jax.metrics.tusimple import LSTR_TIME_LIMIT, MORE_LANES
+from tflane_jax.scoring.columns import columns
 from tflane_jax.scoring.openlane_v2 import AREA_POINTS, CENTERLINE_POINTS, LINE_POINTS
 
 Remarks = Callable[[Mapping[Any, Any], Mapping[Any, Any]], list[str]]
@@ -63,8 +64,13 @@ def segments(predictions: Mapping[Any, SegmentDetections], truth: Mapping[Any, S
 
 
 def images(predictions: Mapping[Any, RowLanes], truth: Mapping[Any, RowLanes], time_limit: float) -> list[str]:
-    """Return remarks on images that count as without lanes, and on labels at other rows; the limit is milliseconds."""
-    return [*_slow(predictions, time_limit), *_too_many(predictions, truth), *_other_rows(truth)]
+    """Return remarks on images that count as without lanes, on other rows and on other columns; the limit: ms."""
+    return [
+        *_slow(predictions, time_limit),
+        *_too_many(predictions, truth),
+        *_other_rows(truth),
+        *columns(predictions, truth),
+    ]
 
 
 def nothing_near(

@@ -1,5 +1,6 @@
 """ImageNet weights: torchvision's names and layouts, what a run may start from, what is refused."""
 
+import pickle
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -108,6 +109,14 @@ def test_other_checkpoints_are_no_backbone():
     assert not is_backbone(f"img_backbone.{name}" for name in names)
     assert not is_backbone([*names, "transformer.decoder.weight"])
     assert not is_backbone([])
+    assert is_backbone(names, ["epoch"])
+
+
+def test_what_is_no_tensor_is_named_where_one_should_be(tmp_path):
+    path = tmp_path / "resnet.pkl"
+    path.write_bytes(pickle.dumps(torchvision_state() | {"conv1.weight": "lost", "epoch": 7}))
+    with pytest.raises(UserError, match=r"resnet.pkl: conv1.weight holds text, expected floating-point numbers"):
+        load_backbone(path, host())
 
 
 @pytest.mark.slow

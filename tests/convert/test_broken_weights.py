@@ -1,5 +1,6 @@
 """Weights that no training leaves behind, or that are of another network, are refused with the file's name."""
 
+import pickle
 import re
 from dataclasses import replace
 
@@ -133,6 +134,32 @@ def test_broken_attention_is_refused_where_a_product_replaces_it(change, kind, p
     assert said.startswith(str(path))
     messages = name, "which are none of one attention", "value/bias is absent in the file"
     assert any(message in said for message in messages), said
+
+
+# By what stands in place of a tensor: the value, and what it holds.
+OTHERS = {
+    "text": ("weights", "text"),
+    "an array of text": (np.array(["1.5"]), "text"),
+    "dates": (np.zeros(3, "datetime64[s]"), "dates"),
+    "objects": (np.array([None]), "Python objects"),
+    "a list": ([[1.0, 2.0]], "a value of type list"),
+    "nothing": (None, "a value of type NoneType"),
+}
+
+
+@pytest.mark.parametrize("encoder", [TINY.encoder, GTN, GcnEncoderConfig(1, hidden=12)], ids=lambda e: type(e).__name__)
+@pytest.mark.parametrize("kind", OTHERS)
+def test_what_is_no_tensor_is_named_where_one_should_be(kind, encoder, path):
+    value, held = OTHERS[kind]
+    others = {"epoch": 7, "note": "not a tensor's name", f"module.{PROJECTION}": value}
+    state = {name: tensor for name, tensor in lstr_state().items() if name != PROJECTION} | others
+    files = [path.with_suffix(".pkl")]
+    files[0].write_bytes(pickle.dumps(state))
+    if isinstance(value, np.ndarray):
+        files.append(write(path, state))
+    for file in files:
+        with pytest.raises(UserError, match=rf"^{re.escape(str(file))}: module.{re.escape(PROJECTION)} holds {held}, "):
+            load_lstr(file, replace(TINY, encoder=encoder))
 
 
 DAMAGE = {

@@ -214,6 +214,9 @@ def test_every_tensor_of_a_detector_has_its_place(name, tmp_path):
     np.savez(path, **incomplete)
     with pytest.raises(UserError, match=r"heads_1/class.*bias is absent in the file and \d in the model"):
         load_host(path, model)
+    np.savez(path, **incomplete, **{"pts_bbox_head.cls_branches.1.6.bias": np.array("lost")})
+    with pytest.raises(UserError, match=r"cls_branches.1.6.bias holds text, expected floating-point numbers"):
+        load_host(path, model)
     np.savez(path, **state, **{"pts_bbox_head.surplus.weight": np.zeros(3)})
     with pytest.raises(UserError, match="is no tensor of"):
         load_host(path, model)

@@ -172,7 +172,7 @@ def test_training_checkpoints(tmp_path, write):
     path = write(tmp_path / "w.tar", checkpoint)
     found = read_checkpoint(path)
     assert_state(found.tensors, {"module.a": GRID, "module.b": GRID[0]})
-    assert (found.entry, found.others) == ("state_dict", ("iterations",))
+    assert (found.entry, found.others) == ("state_dict", {"iterations": "a value of type int"})
     assert list(read_state_dict(path, "optimizer/moments")) == ["exp_avg", "step"]
     assert read_checkpoint(path, "optimizer").entry == "optimizer/moments"
     with pytest.raises(UserError, match=r"no entry ema; the file holds epoch, best, args"):
@@ -221,9 +221,9 @@ def test_arrays_in_npz_and_plain_pickles(tmp_path):
     for name in ("w.npz", "small.npz", "w.pkl"):
         found = read_checkpoint(tmp_path / name)
         assert_state(found.tensors, {"a": GRID, "b": np.array(3)})
-        assert found.others == ("names",)
+        assert found.others == {"names": "text"}
     np.savez(tmp_path / "objects.npz", a=np.array([None]))
-    with pytest.raises(UserError, match=r"objects\.npz is no PyTorch checkpoint.*Object arrays"):
+    with pytest.raises(UserError, match=r"objects\.npz: a holds Python objects, which are not read"):
         read_state_dict(tmp_path / "objects.npz")
 
 

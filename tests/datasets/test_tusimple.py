@@ -205,21 +205,23 @@ def moved(root, folder, *names):
         (root / name).rename(root / folder / name)
 
 
-def test_the_archives_may_have_folders_of_their_own(root):
+@pytest.mark.parametrize("below", ["", "LaneDetection/"])
+def test_the_archives_may_have_folders_of_their_own(root, below):
     shutil.copy(root / "label_data_0531.json", root / "test_label.json")
     plain = {split: dataset_of(root, split=split).example(0) for split in ("train", "val", "test")}
-    shutil.copytree(root / "clips" / "1", root / "test_set" / "clips" / "1")
-    (root / "test_set" / "test_tasks_0627.json").write_text("")
-    moved(root, "train_set", "clips", "label_data_0313.json", "label_data_0531.json")
+    tests = root / below / "test_set"
+    shutil.copytree(root / "clips" / "1", tests / "clips" / "1")
+    (tests / "test_tasks_0627.json").write_text("")
+    moved(root, f"{below}train_set", "clips", "label_data_0313.json", "label_data_0531.json")
     for at_root in (True, False):  # the test labels are a download of their own
         if not at_root:
-            (root / "test_label.json").rename(root / "test_set" / "test_label.json")
+            (root / "test_label.json").rename(tests / "test_label.json")
         for split, expected in plain.items():
             found = dataset_of(root, split=split)
             jax.tree.map(np.testing.assert_array_equal, found.example(0), expected)
             assert len(found) == 2
     assert len(dataset_of(root, split="all")) == 4
-    (root / "test_set" / "test_label.json").unlink()
+    (tests / "test_label.json").unlink()
     with pytest.raises(UserError, match=r"test_tasks_0627.json names the test images without their lanes\): download"):
         dataset_of(root, split="test")
 

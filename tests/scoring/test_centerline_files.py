@@ -182,14 +182,19 @@ def test_a_pickle_that_runs_code_is_refused(files, capsys):
     ("arguments", "message"),
     [
         (["openlane-v3", "a.pkl", "b.pkl"], "no protocol 'openlane-v3', only openlane-v2.1-centerline"),
-        ([PROTOCOL, "a.pkl", "b.pkl"], "cannot read a.pkl"),
+        ([PROTOCOL, "nowhere.pkl", "b.pkl"], "cannot read nowhere.pkl: No such file"),
+        ([PROTOCOL, "a.pkl", "nowhere"], "cannot read nowhere: No such file or directory"),
+        ([PROTOCOL, "a.pkl", "b.pkl", "--scenes", "nowhere"], "cannot read nowhere: No such file or directory"),
         ([PROTOCOL, "a.txt", "b.pkl"], "a.txt: expected a .pkl, .json or .npz file"),
         ([PROTOCOL, "a.npy", "b.pkl"], "a.npy: expected a .pkl, .json or .npz file; docs/scoring.md says"),
         (["lanesegnet", "a.txt", "b.pkl"], "a.txt: expected a .json or .pkl file"),
         ([PROTOCOL, "a.pkl", "b.pkl", "--bootstrap", "-1"], "--bootstrap -1"),
     ],
 )
-def test_wrong_arguments_are_named(arguments, message, capsys):
+def test_wrong_arguments_are_named(arguments, message, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    for name in ("a.pkl", "a.txt", "a.npy", "b.pkl"):
+        (tmp_path / name).touch()
     assert main(["score", *arguments]) == 2
     assert message in capsys.readouterr().err
 

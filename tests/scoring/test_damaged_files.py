@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import pickle
 import re
 from pathlib import Path
 
@@ -92,6 +93,18 @@ def _scaled(factor):
     return change
 
 
+def _boxed(side, change):
+    """Return the change of the boxes of all traffic elements."""
+
+    def changed(content):
+        frames = content["results"] if side == "predictions" else content
+        for frame in frames.values():
+            for element in frame["predictions" if side == "predictions" else "annotation"]["traffic_element"]:
+                element["points"] = change(element["points"])
+
+    return changed
+
+
 REMARKS = {
     "dense centerlines": (
         Case("centerline", "predictions", "", "", _resampled(201)),
@@ -109,6 +122,19 @@ REMARKS = {
         Case("maptr", "predictions", "", "", _scaled(1 / 60)),
         r"predicted lines reach 0.15 from the origin, true ones 9 .*: are the predictions normalised",
     ),
+    **{
+        f"boxes of {form} {side} that {fault}": (
+            Case(form, side, "", "", _boxed(side, change)),
+            f"all 3 boxes of {'predicted' if side == 'predictions' else 'true'} traffic elements {fault}: are",
+        )
+        for form in ("centerline", "segment")
+        for side in ("predictions", "truth")
+        for fault, change in (
+            ("lie between 0 and 1, as if normalised", lambda box: box / 1550),
+            ("have no area", lambda box: box[:1] + 0 * box),
+            ("lie left of the image or above it", lambda box: box - 20),
+        )
+    },
     "rows of another camera": (
         Case("tusimple", "truth", "", "", put(0, "h_samples", [245, 255, 265, 275])),
         r"1 of 3 frames are labelled at other rows than TuSimple's.*\(clips/0313/0/20.jpg\)",
@@ -211,11 +237,27 @@ def test_nuscenes_samples_name_the_scenes_of_maptr(folder, tmp_path, capsys):
         ({"s0": "\ud800"}, r"s0 has the scene '\\ud800', expected a text"),
         ([*table, {"token": "s0", "scene_token": "b"}], "row 3 has the scene 'b', another row 'a': name one"),
         ([{"token": "s0"}], "row 0 lacks the entry 'scene_token'"),
+        ({"s1\n": 1}, r"'s1\\n' has the scene 1"),
         (7, "is of type int, expected a list"),
     ):
         scenes.write_text(json.dumps(content))
         with pytest.raises(UserError, match=message):
             run(valid(folder), folder, scenes=scenes)
+
+
+def test_a_scene_with_codes_is_quoted_in_the_table(folder, tmp_path, capsys):
+    scenes = tmp_path / "scenes.json"
+    scenes.write_text(json.dumps({"s0": "a\x1b[2J", "s1": "b", "s2": "b"}))
+    assert run(valid(folder), folder, by="scene", scenes=scenes) == 0
+    assert "| 'a\\x1b[2J' |" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("content", [{10**5000: "a"}, [{"token": 10**5000, "scene_token": "a"}]])
+def test_scenes_of_a_pickle_with_a_huge_number_are_refused(folder, tmp_path, content):
+    scenes = tmp_path / "scenes.pkl"
+    scenes.write_bytes(pickle.dumps(content))
+    with pytest.raises(UserError, match=r"scenes.pkl.*: the frame an integer of many digits is no name"):
+        run(valid(folder), folder, scenes=scenes)
 
 
 @pytest.mark.parametrize("protocol", ["maptr", "maptrv2", "maptr-iou", "maptrv2-iou"])

@@ -118,6 +118,15 @@ def test_a_count_of_points_that_is_an_array_is_named(tmp_path):
         read_truth(tmp_path / "anns.pkl")
 
 
+def test_lines_may_be_predicted_twice_and_centerlines_share_a_part(tmp_path):
+    line = np.array([[0.0, 0.0], [0.0, 9.0]])
+    truth = MapTruth([line, line, line], np.array([0, 3, 3]))
+    found = MapDetections([line] * 4, np.array([0, 0, 3, 3]), np.array([0.9, 0.8, 0.7, 0.6]))
+    write(tmp_path, [(found, truth)])
+    code, row = run(tmp_path)
+    assert (code, row["AP_divider"]) == (0, 1.0)
+
+
 def test_the_title_names_centerlines_that_the_first_sample_lacks(tmp_path, capsys):
     line = [np.array([[0.0, 0.0], [0.0, 9.0]])]
     samples = [(MapDetections(line, np.array([c]), np.array([0.9])), MapTruth(line, np.array([c]))) for c in (0, 3)]

@@ -1,8 +1,10 @@
 """`tflane score tusimple` on label files: official numbers, and errors for damaged files."""
 
+import itertools
 import json
 import re
 
+import numpy as np
 import pytest
 
 from tests.metrics.test_tusimple import golden
@@ -53,13 +55,16 @@ def test_files_give_the_official_numbers(tmp_path, name):
 
 
 def test_real_labels_against_themselves(tmp_path):
-    path = shared_root() / "data" / "tusimple" / "LaneDetection" / "label_data_0313.json"
-    if not path.exists():
-        pytest.skip("real TuSimple labels are absent")
-    labels = [json.loads(line) for line in path.read_text().splitlines()]
+    labels = real_labels()
     code, row = run(tmp_path, [record | {"run_time": 1} for record in labels], labels)
     assert code == 0
     assert (row["frames"], row["FP"], row["FN"]) == (len(labels), 0.0, 0.0)
+
+
+def test_labels_without_a_point_may_be_there_twice(tmp_path):
+    """The official labels have such images."""
+    truth = [record | {"lanes": [record["lanes"][0], [-2] * 4, [-2] * 4]} for record in TRUTH]
+    assert run(tmp_path, GUESS, truth)[1]["FP"] == 0.0
 
 
 def test_slow_images_are_remarked(tmp_path, capsys):
@@ -79,6 +84,64 @@ def test_images_with_too_many_lanes_are_remarked(tmp_path, capsys, more):
     row = run(tmp_path, found, TRUTH[:1])[1]
     said = "1 of 1 images have over 2 lanes more than their labels and count as without lanes, by TuSimple's rule"
     assert (row["FN"] == 1.0) == (said in capsys.readouterr().err) == (more == 3)
+
+
+def real_labels():
+    path = shared_root() / "data" / "tusimple" / "LaneDetection" / "label_data_0313.json"
+    if not path.exists():
+        pytest.skip("real TuSimple labels are absent")
+    return [json.loads(line) for line in path.read_text().splitlines()]
+
+
+def moved(records, change):
+    """Return predictions whose columns are changed."""
+    return [
+        {
+            "raw_file": record["raw_file"],
+            "lanes": [[change(x) if x >= 0 else x for x in lane] for lane in record["lanes"]],
+            "run_time": 1,
+        }
+        for record in records
+    ]
+
+
+@pytest.mark.parametrize("labels", [lambda: TRUTH, real_labels], ids=["hand-made", "real"])
+@pytest.mark.parametrize(
+    ("change", "formula"),
+    [
+        (lambda x: x / 2, "2 x"),
+        (lambda x: 2 * x, "0.5 x"),
+        (lambda x: x / 12.8, "12.8 x"),
+        (lambda x: x + 90, "1 x - 90"),
+        (lambda x: x + 1e5, "1 x - 100000"),
+    ],
+)
+def test_columns_of_another_image_size_are_remarked(tmp_path, capsys, labels, change, formula):
+    assert run(tmp_path, moved(labels(), change), labels())[0] == 0
+    said = capsys.readouterr().err
+    assert f"% of the predicted lanes are near a true one, but 100% with {formula} in place of x: are they" in said
+
+
+def test_columns_with_random_errors_have_no_remark(tmp_path, capsys):
+    rng = np.random.default_rng(0)
+    for error in (3.0, 12.0):
+        assert (
+            run(
+                tmp_path, moved(real_labels(), lambda x, e=error: max(float(x + rng.normal(0, e)), 0.0)), real_labels()
+            )[0]
+            == 0
+        )
+        assert "near" not in capsys.readouterr().err
+
+
+def test_columns_near_no_lane_or_far_outside_are_remarked(tmp_path, capsys):
+    zigzag = itertools.cycle([0, 640, 210, 450])
+    run(tmp_path, moved(TRUTH, lambda x: next(zigzag)), TRUTH)
+    assert "no predicted lane is near a true one: are x pixels of the labelled image" in capsys.readouterr().err
+    far = [moved(TRUTH, lambda x: 5000.0 if x == 320 else x)[0], *GUESS[1:]]
+    run(tmp_path, far)
+    said = "1 predicted points of 1 images reach x 5000, true ones 320 (clips/0313/0/20.jpg): are they outside"
+    assert said in capsys.readouterr().err
 
 
 def test_predictions_and_labels_that_are_swapped_are_guessed(tmp_path, capsys):

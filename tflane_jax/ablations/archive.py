@@ -29,7 +29,8 @@ from tflane_jax.errors import UserError
 from tflane_jax.evaluation.by_scene import DIGITS
 from tflane_jax.evaluation.results import SceneRatio, SceneSamples
 from tflane_jax.files.atomic import write_bytes
-from tflane_jax.files.fields import items, member, parse_json, shown, whole_number
+from tflane_jax.files.fields import items, member, parse_json, whole_number
+from tflane_jax.files.wording import shown
 
 FORMAT = 1
 LARGEST_FILE, LARGEST_TEXT = 2**23, 2**26

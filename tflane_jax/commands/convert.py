@@ -14,7 +14,7 @@ from tflane_jax.config import load_config
 from tflane_jax.convert.backbone import PART as BACKBONE
 from tflane_jax.convert.backbone import is_backbone, load_backbone
 from tflane_jax.convert.published import load_weights
-from tflane_jax.convert.torch_file import read_state_dict
+from tflane_jax.convert.torch_file import read_checkpoint
 from tflane_jax.convert.weights_files import lane_graph_weights
 from tflane_jax.errors import UserError
 from tflane_jax.plots.tables import format_table, save_table
@@ -61,7 +61,7 @@ def convert(
     if weights is None:
         raise UserError(f"{reference} names no weights: add --weights FILE")
     part = None
-    if isinstance(config.task, LaneGraphTask) and is_backbone(read_state_dict(lane_graph_weights(weights))):
+    if isinstance(config.task, LaneGraphTask) and _is_backbone(lane_graph_weights(weights)):
         if edge_weight is not None:
             raise UserError(f"--edge-weight is of GTN encoders: {weights} is a backbone, leave it out")
         part = BACKBONE
@@ -73,3 +73,8 @@ def convert(
     title = f"{weights}: every tensor and what becomes of it"
     save_table(out / _TABLE, table, {"weights": str(weights)}, title=title)
     return table, title, part
+
+
+def _is_backbone(path: Path) -> bool:
+    checkpoint = read_checkpoint(path)
+    return is_backbone(checkpoint.tensors, checkpoint.others)

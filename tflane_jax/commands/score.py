@@ -10,6 +10,7 @@ from typing import Any
 
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import check_stem
+from tflane_jax.files.wording import named
 from tflane_jax.metrics.groups import shown_of_part
 from tflane_jax.plots.tables import format_table, save_table, written_to
 from tflane_jax.scoring import remarks as about
@@ -25,10 +26,10 @@ def run(options: argparse.Namespace) -> int:
     """Score, print the table, and write it as Markdown and JSON."""
     protocol = find_protocol(options.protocol)
     _check(options, protocol)
-    named: Path | None = options.scenes
-    scenes = None if named is None else read_scenes(named)
+    drives: Path | None = options.scenes
+    scenes = None if drives is None else read_scenes(drives)
     predictions, truth = protocol.read(options.predictions, options.truth)
-    scene_of = protocol.scene_of if named is None or scenes is None else scene_names(scenes, truth, named)
+    scene_of = protocol.scene_of if drives is None or scenes is None else scene_names(scenes, truth, drives)
     files = f"{options.predictions} against {options.truth}"
     if options.bootstrap and truth:
         check_bootstrap(len(set(map(scene_of, truth))))
@@ -39,13 +40,13 @@ def run(options: argparse.Namespace) -> int:
     remarks = protocol.remarks(predictions, truth)
     if protocol.found and not remarks:  # which may be the reason
         remarks += about.nothing_near(predictions, truth, scored.total().get(protocol.found), protocol.frame)
-    if options.bootstrap and protocol.no_scenes and named is None:
+    if options.bootstrap and protocol.no_scenes and drives is None:
         remarks.append(f"{protocol.no_scenes}: the intervals are too narrow (name the drives by --scenes FILE)")
     for remark in remarks:
         print(f"tflane: {remark}", file=sys.stderr)
     rows = _rows(scored, options.bootstrap)
     if options.by == "scene":
-        rows += [{"part": name, **values} for name, values in scored.by_scene(protocol.of_scene).items()]
+        rows += [{"part": named(name), **values} for name, values in scored.by_scene(protocol.of_scene).items()]
     rows += [{"part": group} | shown_of_part(values) for group, values in (groups or {}).items() if group != "all"]
 
     title = f"{options.predictions.name}: {scored.protocol}"

@@ -13,8 +13,8 @@ import jax
 import jax.numpy as jnp
 
 from tflane_jax.convert.lstr import RESNET
-from tflane_jax.convert.renaming import Converted, below, check_fits, convert, naming, size_text
-from tflane_jax.convert.torch_file import read_state_dict
+from tflane_jax.convert.renaming import Converted, below, check_fits, check_types, convert, naming, size_text
+from tflane_jax.convert.torch_file import read_checkpoint
 from tflane_jax.errors import UserError
 from tflane_jax.layers.batch_norm import STATISTICS
 from tflane_jax.layers.resnet import ResNet, ResNetConfig
@@ -28,9 +28,14 @@ _CLASSIFIER = re.compile(r"(module\.)?fc\.(weight|bias)")
 _TENSOR = re.compile(r"(module\.)?(conv1|bn1|layer\d+\.\d+\.(conv\d|bn\d|downsample\.[01])|fc)\.\w+")
 
 
-def is_backbone(names: Iterable[str]) -> bool:
-    """Return whether tensors of these names are a torchvision ResNet, with or without its classifier."""
-    names = list(names)
+def is_backbone(names: Iterable[str], others: Iterable[str] = ()) -> bool:
+    """Return whether tensors of these names are a torchvision ResNet, with or without its classifier.
+
+    Args:
+        names: of all tensors.
+        others: names of what else there is: only what should be a tensor counts.
+    """
+    names = [*names, *filter(_TENSOR.fullmatch, others)]
     return "conv1.weight" in {name.removeprefix("module.") for name in names} and all(map(_TENSOR.fullmatch, names))
 
 
@@ -50,14 +55,17 @@ def load_backbone(path: Path, model: HostConfig) -> tuple[Params, list[dict[str,
         raise UserError(
             f"{path}: weights of a backbone are for models with cameras: give the model an encoder of those"
         )
-    state = read_state_dict(path)
-    if not is_backbone(state):
+    checkpoint = read_checkpoint(path)
+    state = checkpoint.tensors
+    if not is_backbone(state, checkpoint.others):
         raise UserError(f"{path}: its tensors are not those of a torchvision ResNet (conv1.weight, layer1.0...)")
     config = encoder.images.backbone
     kept = {name: tensor for name, tensor in state.items() if not _CLASSIFIER.fullmatch(name)}
     norms = rf"{PART}/(.*/)?\w*bn\d?/.*" if config.frozen_norms else "(?!)"
+    rules = below("", PART, RESNET)
     with naming(path):
-        found = convert(kept, below("", PART, RESNET), "ResNet", frozen=norms)
+        check_types(checkpoint.others, rules)
+        found = convert(kept, rules, "ResNet", frozen=norms)
     check_fits(found.variables, _expected(config), path)
     table = _with_classifier(found, {name: state[name].shape for name in state.keys() - kept.keys()})
     return found.variables["params"] | {STATISTICS: found.variables["batch_stats"]}, table

@@ -22,10 +22,10 @@ from tflane_jax.convert.bevformer import BEV_CONSTRUCTER, IMAGE_ENCODER
 from tflane_jax.convert.fitting import Expected, Missing, expected_variables, fitted
 from tflane_jax.convert.lanesegnet import LANESEGNET_HEAD
 from tflane_jax.convert.maptr import MAPTR_HEAD, MAPTRV2_HEAD, area_head
-from tflane_jax.convert.renaming import Converted, Rule, below, convert, naming
+from tflane_jax.convert.renaming import Converted, Rule, below, check_types, convert, naming
 from tflane_jax.convert.sd_map import SD_MAP_ENCODER, SMERF_CONSTRUCTER
 from tflane_jax.convert.toponet import BASELINE_LANES, ELEMENTS, RELATIONSHIP, TOPONET_LANES
-from tflane_jax.convert.torch_file import read_state_dict
+from tflane_jax.convert.torch_file import read_checkpoint
 from tflane_jax.errors import UserError
 from tflane_jax.geometry.namespace import AnyArray
 from tflane_jax.models.bevformer_detr import BevFormerDetrConfig
@@ -69,6 +69,18 @@ def _head_rules(model: PublishedHost) -> tuple[str, tuple[Rule, ...]]:
     )
 
 
+def _rules(model: PublishedHost) -> tuple[str, tuple[Rule, ...]]:
+    """Return the network's name and the rules of all of its tensors."""
+    network, heads = _head_rules(model)
+    sd_map = model.priors.sd_map is not None
+    return f"{network} with SMERF" if sd_map else network, (
+        *below("", "encoder/images", IMAGE_ENCODER),
+        *below(r"bev_constructor\.", "encoder/bev", SMERF_CONSTRUCTER if sd_map else BEV_CONSTRUCTER),
+        *(below(r"map_encoder\.", "sd_map_tokens", SD_MAP_ENCODER) if sd_map else ()),
+        *heads,
+    )
+
+
 def convert_host(state: Mapping[str, AnyArray], model: PublishedHost) -> Converted:
     """Return the variables of a whole host with cameras, and an account of every tensor.
 
@@ -80,17 +92,10 @@ def convert_host(state: Mapping[str, AnyArray], model: PublishedHost) -> Convert
     Raises:
         UserError: a tensor that the detector does not have.
     """
-    network, heads = _head_rules(model)
-    sd_map = model.priors.sd_map is not None
-    rules = (
-        *below("", "encoder/images", IMAGE_ENCODER),
-        *below(r"bev_constructor\.", "encoder/bev", SMERF_CONSTRUCTER if sd_map else BEV_CONSTRUCTER),
-        *(below(r"map_encoder\.", "sd_map_tokens", SD_MAP_ENCODER) if sd_map else ()),
-        *heads,
-    )
+    network, rules = _rules(model)
     frozen = isinstance(model.encoder, CameraEncoderConfig) and model.encoder.images.backbone.frozen_norms
     norms = r"encoder/images/backbone/(.*/)?\w*bn\d?/.*" if frozen else "(?!)"
-    return convert(state, rules, f"{network} with SMERF" if sd_map else network, frozen=norms)
+    return convert(state, rules, network, frozen=norms)
 
 
 def load_host(path: Path, model: PublishedHost, missing: Missing = "left out") -> tuple[Params, list[dict[str, str]]]:
@@ -109,7 +114,9 @@ def load_host(path: Path, model: PublishedHost, missing: Missing = "left out") -
             f"{path}: published weights are those of models with cameras: give the model an encoder of cameras"
         )
     with naming(path):
-        converted = convert_host(read_state_dict(path), model)
+        checkpoint = read_checkpoint(path)
+        check_types(checkpoint.others, _rules(model)[1])
+        converted = convert_host(checkpoint.tensors, model)
     return fitted(converted, _expected(model), path, missing)
 
 

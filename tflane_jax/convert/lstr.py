@@ -15,8 +15,8 @@ import jax.numpy as jnp
 
 from tflane_jax.convert.fitting import Expected, Missing, expected_variables, fitted
 from tflane_jax.convert.lstr_graphs import GRAPH_LAYER, UNMAPPED, as_graph_state, check_encoder, selections
-from tflane_jax.convert.renaming import Converted, Rule, below, convert, naming, put, size_text
-from tflane_jax.convert.torch_file import read_state_dict
+from tflane_jax.convert.renaming import Converted, Rule, below, check_types, convert, naming, put, size_text
+from tflane_jax.convert.torch_file import read_checkpoint
 from tflane_jax.convert.weights_files import check_digest, find_weights
 from tflane_jax.errors import UserError
 from tflane_jax.geometry.namespace import AnyArray
@@ -69,6 +69,7 @@ _AROUND_THE_ENCODER: tuple[Rule, ...] = (
     (r"shared_embed\.layers\.(\d+)\.(weight|bias)", r"heads/shared/linear_\1/\2", "linear"),
 )
 _ENCODER = r"transformer\.encoder\.layers\.(\d+)\."
+_PUBLISHED = (*_AROUND_THE_ENCODER, *below(_ENCODER, r"encoder/layer_\1", ENCODER_LAYER))
 
 
 def convert_lstr(
@@ -85,8 +86,7 @@ def convert_lstr(
         UserError: a tensor that LSTR does not have.
     """
     if encoder is None or isinstance(encoder, TransformerEncoderConfig):
-        rules = below(_ENCODER, r"encoder/layer_\1", ENCODER_LAYER)
-        return convert(state, (*_AROUND_THE_ENCODER, *rules), "LSTR", frozen=r"backbone/bn1/.*")
+        return convert(state, _PUBLISHED, "LSTR", frozen=r"backbone/bn1/.*")
     rules = below(_ENCODER, r"encoder/layer_\1", (*GRAPH_LAYER[type(encoder)], *_FED))
     state, remarks = as_graph_state(state, encoder)
     converted = convert(state, (*_AROUND_THE_ENCODER, *rules), "LSTR", frozen=r"backbone/bn1/.*")
@@ -124,9 +124,10 @@ def load_lstr(
             f"{path} is of a transformer, and this encoder has parameters that it lacks: write a run by tflane convert"
         )
     with naming(path):
-        state = read_state_dict(path)
-        check_digest(state, path, published)
-        converted = convert_lstr(state, model.encoder, edge_weight)
+        checkpoint = read_checkpoint(path)
+        check_types(checkpoint.others, _PUBLISHED)
+        check_digest(checkpoint.tensors, path, published)
+        converted = convert_lstr(checkpoint.tensors, model.encoder, edge_weight)
     return fitted(converted, _expected(model), path, missing, unmapped)
 
 

@@ -76,6 +76,15 @@ def convert(state: Mapping[str, AnyArray], rules: Rules, network: str, frozen: s
     return Converted(variables, table)
 
 
+def check_types(others: Mapping[str, str], rules: Rules) -> None:
+    """Raise UserError if an entry that is no tensor has the name of one; `others` says what they hold, by name."""
+    for name, held in others.items():
+        plain = name.removeprefix("module.")
+        sort = next((sort for pattern, _, sort in rules if re.fullmatch(pattern, plain)), "unused")
+        if sort != "unused" and left_out(plain) is None:
+            raise UserError(f"{name} holds {held}, expected floating-point numbers")
+
+
 def left_out(name: str) -> str | None:
     """Return why a tensor that checkpoints hold beside their weights is not needed."""
     last = name.rpartition(".")[-1]

@@ -19,7 +19,7 @@ import numpy as np
 
 from tflane_jax.convert.torch_pickle import KINDS, Damaged, Tensor, TorchUnpickler, Unreadable, to_array
 from tflane_jax.errors import UserError
-from tflane_jax.files.npz import npz_arrays
+from tflane_jax.files.npz import HoldsObjects, npz_arrays
 from tflane_jax.files.plain_pickle import Refused
 
 _LEGACY_MAGIC = 0x1950A86A20F9469CFC6C
@@ -40,12 +40,12 @@ class Checkpoint:
     Attributes:
         tensors: by name, in the order of the file; floats of fewer than 32 bits as float32.
         entry: path of the tensors in the file, such as "state_dict"; "" is the top level.
-        others: names beside the tensors that are not tensors: counters, settings.
+        others: what the names beside the tensors hold that are not tensors: counters, settings.
     """
 
     tensors: dict[str, np.ndarray]
     entry: str
-    others: tuple[str, ...]
+    others: dict[str, str]
 
 
 def read_state_dict(path: Path, entry: str | None = None) -> dict[str, np.ndarray]:
@@ -111,7 +111,10 @@ def _contents(file: IO[bytes]) -> _Contents:
     archive = zipfile.ZipFile(file)
     names = archive.namelist()
     if any(name.endswith(".npy") for name in names):
-        return _Contents(npz_arrays(file), _nothing, "little")
+        try:
+            return _Contents(npz_arrays(file), _nothing, "little")
+        except HoldsObjects as error:
+            raise Damaged(f"{error}, which are not read, expected numbers. Save the file without them") from None
     objects = [name for name in names if name.split("/", 1)[-1] == "data.pkl"]
     if len(objects) != 1:
         raise Damaged("a zip file, but none of PyTorch's (it has no data.pkl) or of numpy's (no .npy)")
@@ -195,11 +198,11 @@ def _state_dict(contents: _Contents, entry: str | None, size: int) -> Checkpoint
         raise UserError(f"several sets of tensors{_within(entry)}. Say which is meant as `entry`, one of: {listed}")
     (place,) = found
     named, _ = _descend(contents.tree, place)
-    tensors, others = {}, []
+    tensors, others = {}, {}
     most = _MOST_REPEATED + _MOST_SHARED * size
     for name, value in dict.items(named):
         if not isinstance(name, str) or not _is_tensor(value):
-            others.append(str(name) if isinstance(name, (str, int)) else type(name).__name__)
+            others[str(name) if isinstance(name, (str, int)) else type(name).__name__] = _held(value)
         elif isinstance(value, np.ndarray):
             tensors[name] = value
         else:
@@ -208,7 +211,7 @@ def _state_dict(contents: _Contents, entry: str | None, size: int) -> Checkpoint
             except Damaged as error:
                 raise Damaged(f"{_shown((*place, name))}: {error}") from None
             most -= tensors[name].size
-    return Checkpoint(tensors, "/".join(place), tuple(others))
+    return Checkpoint(tensors, "/".join(place), others)
 
 
 def _find(tree: Any, place: tuple[str, ...], seen: set[int]) -> list[tuple[str, ...]]:
@@ -238,6 +241,17 @@ def _descend(tree: Any, place: tuple[str, ...]) -> tuple[Any, tuple[str, ...]]:
 
 def _is_tensor(value: Any) -> bool:
     return isinstance(value, (Tensor, Unreadable)) or (isinstance(value, np.ndarray) and value.dtype.kind in "biufc")
+
+
+_NO_NUMBERS = {"U": "text", "S": "text", "M": "dates", "m": "durations", "O": "Python objects", "V": "records"}
+"""What numpy's arrays hold, by the kind of their elements."""
+
+
+def _held(value: Any) -> str:
+    """Return what an entry that is no tensor holds, for messages."""
+    if isinstance(value, np.ndarray):
+        return _NO_NUMBERS.get(value.dtype.kind, str(value.dtype))
+    return "text" if isinstance(value, (str, bytes)) else f"a value of type {type(value).__name__}"
 
 
 def _described(tree: Any) -> str:

@@ -23,8 +23,9 @@ from jaxtyping import Float, UInt8
 
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import write_json
-from tflane_jax.files.fields import file_within, items, load_json, member, numbers, shown, whole_number
+from tflane_jax.files.fields import file_within, items, load_json, member, numbers, whole_number
 from tflane_jax.files.images import read_image, undistorted
+from tflane_jax.files.wording import shown
 from tflane_jax.geometry import invert_pose
 from tflane_jax.scene import CameraViews
 

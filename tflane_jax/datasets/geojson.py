@@ -20,7 +20,8 @@ from jaxtyping import Float
 
 from tflane_jax.datasets.base import TruncationWarning
 from tflane_jax.errors import LeftOutWarning, UserError
-from tflane_jax.files.fields import load_json, shown
+from tflane_jax.files.fields import load_json
+from tflane_jax.files.wording import shown
 from tflane_jax.scene import SdCategory, SdMap
 from tflane_jax.world.roads.sd_map import SdMapConfig, pack_lines
 

@@ -28,7 +28,8 @@ from tflane_jax.datasets.geojson import Origin, line_coordinates, read_features,
 from tflane_jax.datasets.lane_outlines import HALF_WIDTH, LaneOutline, boundaries
 from tflane_jax.datasets.plausible import check_steps
 from tflane_jax.errors import UserError
-from tflane_jax.files.fields import as_list, shown
+from tflane_jax.files.fields import as_list
+from tflane_jax.files.wording import shown
 from tflane_jax.scene import LineType
 from tflane_jax.scene.logs import LaneSegment, Side, VectorMap
 from tflane_jax.world.roads.map_roadside import lane_points

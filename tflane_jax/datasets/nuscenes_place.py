@@ -12,8 +12,9 @@ from tflane_jax.datasets.nuscenes_log import key_frames, scene_frames, scene_log
 from tflane_jax.datasets.nuscenes_map import MapExpansion, read_expansion
 from tflane_jax.datasets.nuscenes_tables import TABLES, shared_tables
 from tflane_jax.errors import UserError
-from tflane_jax.files.fields import member, shown
+from tflane_jax.files.fields import member
 from tflane_jax.files.json_rows import json_rows
+from tflane_jax.files.wording import shown
 from tflane_jax.scene.logs import Log
 
 SCENE_TABLE = "scene.json"

@@ -29,8 +29,9 @@ from tflane_jax.datasets.nuscenes_log import CATEGORIES, road_user, side_of
 from tflane_jax.datasets.nuscenes_map import flat
 from tflane_jax.datasets.plausible import LONGEST, SHORTEST, check_distance, check_motion, check_place
 from tflane_jax.errors import UserError
-from tflane_jax.files.fields import member, numbers, shown
+from tflane_jax.files.fields import member, numbers
 from tflane_jax.files.npz import read_npz
+from tflane_jax.files.wording import shown
 from tflane_jax.geometry import invert_pose, line_distances, transform_points, wrap_angle, yaw_pose
 from tflane_jax.scene import LineType, RoadUser
 from tflane_jax.scene.logs import KeyFrame, LaneSegment, Log, Tracks, VectorMap

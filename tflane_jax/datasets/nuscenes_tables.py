@@ -19,8 +19,9 @@ from jaxtyping import Float
 
 from tflane_jax.datasets.plausible import FARTHEST
 from tflane_jax.errors import UserError
-from tflane_jax.files.fields import numbers, shown
+from tflane_jax.files.fields import numbers
 from tflane_jax.files.json_rows import json_rows
+from tflane_jax.files.wording import shown
 from tflane_jax.geometry import matrix_from_quaternion, pose_matrix
 
 Row = Mapping[str, Any]

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 
 from tflane_jax.datasets.plausible import first_twice, left_of
 from tflane_jax.errors import UserError
-from tflane_jax.files.fields import items, member, shown
+from tflane_jax.files.fields import items, member
 from tflane_jax.files.openlane import (
     SEGMENT,
     FieldNames,
@@ -20,6 +20,7 @@ from tflane_jax.files.openlane import (
     read_lines,
     read_matrix,
 )
+from tflane_jax.files.wording import shown
 from tflane_jax.geometry import line_lengths
 
 # Metres of mean width below zero: boundaries that the crop has shortened may cross, swapped ones are 3 m the wrong way.

@@ -14,9 +14,10 @@ import numpy as np
 
 from tflane_jax.datasets.openlane_frames import info_path
 from tflane_jax.errors import UserError
-from tflane_jax.files.fields import load_json, member, numbers, shown
+from tflane_jax.files.fields import load_json, member, numbers
 from tflane_jax.files.openlane import CENTERLINE, SEGMENT, FrameKey
 from tflane_jax.files.plain_pickle import load_plain_pickle
+from tflane_jax.files.wording import shown
 
 # Frames whose pose is compared, evenly spread; bytes beyond which a pickle is not read.
 _COMPARED, _LARGEST = 20, 8 * 2**30

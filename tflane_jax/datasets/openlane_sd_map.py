@@ -18,8 +18,9 @@ from jaxtyping import Float
 
 from tflane_jax.datasets.base import TruncationWarning
 from tflane_jax.errors import UserError
-from tflane_jax.files.fields import as_list, load_json, member, numbers, shown
+from tflane_jax.files.fields import as_list, load_json, member, numbers
 from tflane_jax.files.openlane import FrameKey
+from tflane_jax.files.wording import shown
 from tflane_jax.scene import SdCategory, SdMap
 from tflane_jax.world.roads.sd_map import SdMapConfig, pack_lines
 

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from tflane_jax.errors import UserError
-from tflane_jax.files.fields import as_list, is_time, load_json, member, shown
+from tflane_jax.files.fields import as_list, is_time, load_json, member
+from tflane_jax.files.wording import shown
 
 SPLIT_FILE, LOG_FILE = "data_dict_subset_A.json", "subset_A_segment_to_av2_log.json"
 

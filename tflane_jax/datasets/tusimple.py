@@ -5,8 +5,8 @@ lane, -2 where the lane has no point. Examples always have the 56 rows of the te
 that a file does not label are absent. Source: https://github.com/TuSimple/tusimple-benchmark. Images of other cameras
 may have other sizes; rows and x are pixels of the image.
 
-The folder may hold label files and `clips` itself, in `LaneDetection` (LSTR's layout), or in `train_set` and
-`test_set`, as the archives are often unpacked.
+The folder may hold label files and `clips` itself, in `LaneDetection` (LSTR's layout), or, in either, in `train_set`
+and `test_set`, as the archives are often unpacked.
 """
 
 from __future__ import annotations
@@ -43,7 +43,10 @@ _SPLIT_FILES: dict[LabelSplit, tuple[str, ...]] = {
     "all": tuple(sorted(_TRAIN + _VAL)),
 }
 # Folders below the root in which label files and clips may be.
-_FOLDERS = ("", "LaneDetection", "train_set", "test_set")
+_FOLDERS = (
+    *("", "LaneDetection", "train_set", "test_set"),
+    *("LaneDetection/train_set", "LaneDetection/test_set"),
+)
 # Comes with the test images and names them, without lanes.
 _TASKS = "test_tasks_0627.json"
 
@@ -53,8 +56,8 @@ class TuSimpleConfig:
     """Which frames, and how they become examples.
 
     Attributes:
-        root: folder with the label files and `clips`, or with folders `LaneDetection`, `train_set` or `test_set` that
-            hold them.
+        root: folder with the label files and `clips`, or with folders `LaneDetection`, `train_set` or `test_set`
+            that hold them; the last two may be in `LaneDetection`.
         split: "train" (label files 0313, 0601) and "val" (0531) are LSTR's parts of the official training set; "test";
             "all" is the whole training set and any further `label_data_*.json`. Missing files are left out.
         label_files: file names in these folders to read instead of the split's files; each must exist.

@@ -8,7 +8,6 @@ from __future__ import annotations
 import itertools
 import json
 import re
-import reprlib
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,11 +16,14 @@ import numpy as np
 
 from tflane_jax.errors import UserError
 from tflane_jax.files.plain_pickle import load_plain_pickle
+from tflane_jax.files.wording import digits, kind, place, shape_text, shown
 
 _SPACE = re.compile(r"[ \t\n\r]*")
 PICKLE_SUFFIXES = (".pkl", ".pickle")
 _FARTHEST = 1e5
 """Largest coordinate of a line, metres in the vehicle's frame."""
+_ROUNDING = 1e-3
+"""By how much a confidence may be beyond 0 to 1 for its message to speak of rounding."""
 _MOST, _DEEPEST = 10_000_000, 32
 """Numbers in one entry, and lists in lists, that no file of these formats has."""
 
@@ -108,7 +110,7 @@ def _once(where: str) -> Callable[[list[tuple[str, Any]]], dict[str, Any]]:
         if len(entries) < len(pairs):
             names = [name for name, _ in pairs]
             twice = next(name for name in names if names.count(name) > 1)
-            raise UserError(f"{where}: an object has the entry {twice!r} twice: keep one of them")
+            raise UserError(f"{where}: an object has the entry {shown(twice)} twice: keep one of them")
         return entries
 
     return record
@@ -117,7 +119,7 @@ def _once(where: str) -> Callable[[list[tuple[str, Any]]], dict[str, Any]]:
 def member(record: Any, name: str, where: str) -> Any:
     """Return an entry of a mapping."""
     if not isinstance(record, Mapping):
-        raise UserError(f"{where} is {_kind(record)}, expected a mapping with the entry {name!r}")
+        raise UserError(f"{where} is {kind(record)}, expected a mapping with the entry {name!r}")
     if name not in record:
         there = ", ".join(map(shown, list(record)[:6]))
         raise UserError(f"{where} lacks the entry {name!r} (it has {there or 'none'})")
@@ -132,7 +134,7 @@ def items(record: Any, name: str, where: str) -> Sequence[Any]:
 def as_list(value: Any, where: str) -> Sequence[Any]:
     """Return a value that is a list, a tuple or an array."""
     if not (isinstance(value, (list, tuple)) or (isinstance(value, np.ndarray) and value.ndim > 0)):
-        raise UserError(f"{where} is {_kind(value)}, expected a list")
+        raise UserError(f"{where} is {kind(value)}, expected a list")
     return value  # pyright: ignore[reportReturnType]
 
 
@@ -151,25 +153,25 @@ def numbers(value: Any, shape: tuple[int | None, ...], where: str, *, largest: f
     if array.size == 0 and not all(shape):
         array = array.reshape([size or 0 for size in shape])
     if array.ndim != len(shape) or any(n is not None and n != m for n, m in zip(shape, array.shape, strict=True)):
-        raise UserError(f"{where} has shape {array.shape}, expected {_shape(shape)}")
+        raise UserError(f"{where} has shape {array.shape}, expected {shape_text(shape)}")
     if not np.isfinite(array).all():
         index = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
-        raise UserError(f"{where} holds {array[index]}{_at(index)}: numbers must be finite")
+        raise UserError(f"{where} holds {array[index]}{place(index)}: numbers must be finite")
     if (np.abs(array) > largest).any():
         index = tuple(int(i) for i in np.argwhere(np.abs(array) > largest)[0])
-        raise UserError(f"{where} holds {array[index]:g}{_at(index)}: beyond {largest:g} in size")
+        raise UserError(f"{where} holds {array[index]:g}{place(index)}: beyond {largest:g} in size")
     return array
 
 
 def _as_array(value: Any, shape: tuple[int | None, ...], where: str) -> np.ndarray:
-    expected = f"expected numbers of shape {_shape(shape)}"
+    expected = f"expected numbers of shape {shape_text(shape)}"
     if value is None:
-        raise UserError(f"{where} is {_kind(value)}, {expected}")
+        raise UserError(f"{where} is {kind(value)}, {expected}")
     _check_size(value, shape, where)
     try:
         array = np.asarray(value)
     except (TypeError, ValueError, RecursionError):
-        raise UserError(f"{where} is {_kind(value)}, {_ragged(value) or expected}") from None
+        raise UserError(f"{where} is {kind(value)}, {_ragged(value) or expected}") from None
     if array.dtype.kind in "iuf":
         if _has_truth_value(value):
             raise UserError(f"{where} holds a truth value, {expected}")
@@ -177,7 +179,7 @@ def _as_array(value: Any, shape: tuple[int | None, ...], where: str) -> np.ndarr
     if array.dtype.kind == "O" and array.size:  # such as integers of more than 64 bits
         wrong = [item for item in array.flat if not _is_number(item)]
         if wrong:
-            raise UserError(f"{where} holds a value {_kind(wrong[0])}, {expected}")
+            raise UserError(f"{where} holds a value {kind(wrong[0])}, {expected}")
         try:
             return array.astype(np.float64)
         except OverflowError:
@@ -186,8 +188,8 @@ def _as_array(value: Any, shape: tuple[int | None, ...], where: str) -> np.ndarr
         return array.astype(np.float64)
     names = {"S": "text", "U": "text", "c": "complex numbers", "b": "truth values"}
     if array.ndim == 0 or array.dtype.kind not in names:
-        raise UserError(f"{where} is {_kind(value)}, {expected}")
-    raise UserError(f"{where} is {_kind(value)}, {expected}, not {names[array.dtype.kind]}")
+        raise UserError(f"{where} is {kind(value)}, {expected}")
+    raise UserError(f"{where} is {kind(value)}, {expected}, not {names[array.dtype.kind]}")
 
 
 def _check_size(value: Any, shape: tuple[int | None, ...], where: str) -> None:
@@ -207,7 +209,7 @@ def _check_size(value: Any, shape: tuple[int | None, ...], where: str) -> None:
         level = list(itertools.chain.from_iterable(rows))
     raise UserError(
         f"{where} holds more than {_MOST} numbers, or lists nested more than {_DEEPEST} deep, expected numbers of "
-        f"shape {_shape(shape)}"
+        f"shape {shape_text(shape)}"
     )
 
 
@@ -239,14 +241,15 @@ def _ragged(value: Any) -> str | None:
     return f"expected numbers, and rows of one length: row 0 is {sizes[0]}, row {other} {sizes[other]}"
 
 
-def line_points(value: Any, where: str) -> np.ndarray:
-    """Return a line's points (n, 3), metres in the vehicle's frame, n >= 1."""
+def line_points(value: Any, where: str, least: int = 1) -> np.ndarray:
+    """Return a line's points (n, 3), metres in the vehicle's frame, n of at least `least`."""
     points = numbers(value, (None, 3), where)
-    if len(points) == 0:
-        raise UserError(f"{where} is empty: a line has at least one point")
+    if len(points) < least:
+        has = "has one point" if len(points) else "is empty"
+        raise UserError(f"{where} {has}: a line has at least {'one point' if least == 1 else f'{least} points'}")
     if (far := np.abs(points) > _FARTHEST).any():
         index = tuple(int(i) for i in np.argwhere(far)[0])
-        raise UserError(f"{where} holds {points[index]:g}{_at(index)}: expected metres from the vehicle, not a map's")
+        raise UserError(f"{where} holds {points[index]:g}{place(index)}: expected metres from the vehicle, not a map's")
     return points
 
 
@@ -263,8 +266,15 @@ def fractions(value: Any, shape: tuple[int | None, ...], where: str) -> np.ndarr
     if (outside := (array < 0.0) | (array > 1.0)).any():
         index = tuple(int(i) for i in np.argwhere(outside)[0])
         number = f"number {index[0]}" if len(index) == 1 else f"entry {list(index)}"
-        raise UserError(f"{where}: {number} is {array[index]:g}, expected 0 to 1 (apply the sigmoid first)")
+        raise UserError(f"{where}: {number} is {digits(array[index])}, expected 0 to 1{_remedy(array)}")
     return array
+
+
+def _remedy(array: np.ndarray) -> str:
+    """Return what numbers that should be from 0 to 1 seem to be, and what to do then; "" if that is unknown."""
+    if array.min() >= -_ROUNDING and array.max() <= 1.0 + _ROUNDING:
+        return " (a rounding error? limit it to that range)"
+    return " (apply the sigmoid first)" if array.min() < 0.0 else ""
 
 
 def choices(value: Any, shape: tuple[int | None, ...], where: str) -> np.ndarray:
@@ -272,7 +282,7 @@ def choices(value: Any, shape: tuple[int | None, ...], where: str) -> np.ndarray
     array = numbers(_as_integers(value, shape, where), shape, where)
     if (other := (array != 0) & (array != 1)).any():
         index = tuple(int(i) for i in np.argwhere(other)[0])
-        raise UserError(f"{where} holds {array[index]:g}{_at(index)}, expected 0 or 1")
+        raise UserError(f"{where} holds {digits(array[index])}{place(index)}, expected 0 or 1")
     return array == 1
 
 
@@ -299,6 +309,21 @@ def is_text(value: Any) -> bool:
     return True
 
 
+def is_name(value: Any) -> bool:
+    """Return whether a value is a text that can be written, or a whole number of at most 64 bits."""
+    # Python refuses to write integers of more than 4300 digits.
+    whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
+    return is_text(value) or (whole and abs(int(value)) < 2**64)
+
+
+def check_there(path: Path) -> None:
+    """Raise UserError where there is no file or folder of this name."""
+    try:
+        path.stat()
+    except OSError as error:
+        raise UserError(f"cannot read {path}: {error.strerror}") from None
+
+
 def is_time(text: str) -> bool:
     """Return whether a text is a whole number that fits in 64 bits, as a time in nanoseconds does."""
     return text.isdecimal() and len(text) <= 19 and int(text) <= np.iinfo(np.int64).max
@@ -320,29 +345,3 @@ def whole_number(value: Any, low: int, high: int, where: str) -> int:
     if not _is_number(value) or not low <= value <= high or value != int(value):
         raise UserError(f"{where} is {shown(value)}, expected a whole number from {low} to {high}")
     return int(value)
-
-
-def shown(value: Any) -> str:
-    """Return at most 40 characters of a value for a message, whatever it is.
-
-    Python refuses to write integers of more than 4300 digits, alone or in a list.
-    """
-    value = value.item() if isinstance(value, np.generic) else value
-    if isinstance(value, int) and abs(value) >= 2**63:
-        return "an integer of many digits"
-    try:
-        return f"{reprlib.repr(value):.40}"
-    except (RecursionError, ValueError):
-        return f"a value {_kind(value)}"
-
-
-def _at(index: tuple[int, ...]) -> str:
-    return f" at {list(index)}" if index else ""
-
-
-def _kind(value: Any) -> str:
-    return "missing (null)" if value is None else f"of type {type(value).__name__}"
-
-
-def _shape(shape: tuple[int | None, ...]) -> str:
-    return "(" + ", ".join("any" if size is None else str(size) for size in shape) + ("," * (len(shape) == 1)) + ")"

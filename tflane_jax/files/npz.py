@@ -20,6 +20,10 @@ _MOST_MEMORY = 2**34
 _MOST_HELD = {zipfile.ZIP_STORED: 1, zipfile.ZIP_DEFLATED: 1032}
 
 
+class HoldsObjects(ValueError):
+    """An array holds Python objects, which only unpickling would read; the message names the array."""
+
+
 def read_npz(path: Path, names: Collection[str] | None = None) -> dict[str, np.ndarray]:
     """Return the arrays of a file by name; `names` are those to read: missing ones are left out, None reads all.
 
@@ -73,12 +77,14 @@ def _check_sizes(parts: list[zipfile.ZipInfo], size: int) -> None:
 
 
 def _check_header(archive: zipfile.ZipFile, part: zipfile.ZipInfo) -> None:
-    """Raise ValueError if the header of an array claims another size than the archive has for it."""
+    """Raise ValueError if the header of an array claims objects, or another size than the archive has for it."""
     with archive.open(part) as content:
         version = npy.read_magic(content)
         read = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
         shape, _, dtype = read(content)
+        if dtype.hasobject:
+            raise HoldsObjects(f"{part.filename.removesuffix('.npy')} holds Python objects")
         claimed = math.prod(shape) * dtype.itemsize
-        if not dtype.hasobject and claimed != part.file_size - content.tell():
+        if claimed != part.file_size - content.tell():
             has = f"but the file has {part.file_size - content.tell()} for it"
             raise ValueError(f"{part.filename} claims {claimed:.2g} bytes, {has}")

@@ -12,12 +12,15 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from tflane_jax.errors import UserError
-from tflane_jax.files.fields import is_text, items, line_points, member, numbers, shown, whole_number
+from tflane_jax.files.fields import is_name, items, line_points, member, numbers, whole_number
+from tflane_jax.files.wording import shown
 
 ATTRIBUTES = 13
 """Attributes of traffic elements, 0 (unknown) to 12."""
 DENSE_POINTS = 201
 """Points of an annotated centerline."""
+_WIDEST = 1e5
+"""Largest coordinate of a box, pixels."""
 
 
 class FieldNames(NamedTuple):
@@ -50,12 +53,12 @@ class FrameKey(NamedTuple):
         return f"{self.split}/{self.segment}"
 
 
-def read_lines(record: Any, things: str, field: str, where: str) -> list[Float[np.ndarray, "_ 3"]]:
-    """Return one line (n, 3), metres, of each lane, segment or area of an annotation."""
+def read_lines(record: Any, things: str, field: str, where: str, least: int = 1) -> list[Float[np.ndarray, "_ 3"]]:
+    """Return one line (n, 3), metres, n of at least `least`, of each lane, segment or area of an annotation."""
     lines = []
     for i, thing in enumerate(items(record, things, where)):
         at = f"{where}: {things}[{i}]"
-        lines.append(line_points(member(thing, field, at), f"{at}.{field}"))
+        lines.append(line_points(member(thing, field, at), f"{at}.{field}", least))
     return lines
 
 
@@ -81,25 +84,21 @@ def read_elements(record: Any, where: str) -> tuple[Float[np.ndarray, "e 2 2"], 
     boxes = []
     for i, element in enumerate(items(record, "traffic_element", where)):
         at = f"{where}: traffic_element[{i}]"
-        boxes.append(numbers(member(element, "points", at), (2, 2), f"{at}.points"))
+        boxes.append(numbers(member(element, "points", at), (2, 2), f"{at}.points", largest=_WIDEST))
     attributes = read_labels(record, "traffic_element", "attribute", 0, ATTRIBUTES - 1, where)
     return np.array(boxes).reshape(-1, 2, 2), attributes
 
 
-def read_areas(record: Any, where: str) -> tuple[list[Float[np.ndarray, "_ 3"]], Int[np.ndarray, " a"]]:
-    """Return lines and categories (1 crossing, 2 boundary) of the areas."""
-    return read_lines(record, "area", "points", where), read_labels(record, "area", "category", 1, 2, where)
+def read_areas(record: Any, where: str, least: int = 1) -> tuple[list[Float[np.ndarray, "_ 3"]], Int[np.ndarray, " a"]]:
+    """Return lines, of at least `least` points, and categories (1 crossing, 2 boundary) of the areas."""
+    return read_lines(record, "area", "points", where, least), read_labels(record, "area", "category", 1, 2, where)
 
 
 def as_identifier(identifier: Any, where: str) -> FrameKey:
     """Return a key of a collected file as a frame; raises UserError if it is none."""
     named = isinstance(identifier, tuple) and len(identifier) == 3
-    if not named or not all(map(_is_name, identifier)):
-        expected = "expected (split, segment, timestamp) as texts or numbers"
+    # A frame's name is its parts with "/" between them.
+    if not named or not all(is_name(part) and "/" not in str(part) for part in identifier):
+        expected = "expected (split, segment, timestamp) as texts or numbers, without '/' in them"
         raise UserError(f"{where}: the key {shown(identifier)} is no frame, {expected}")
     return FrameKey(*map(str, identifier))
-
-
-def _is_name(part: Any) -> bool:
-    # Python refuses to write integers of more than 4300 digits.
-    return is_text(part) or (isinstance(part, (int, np.integer)) and abs(int(part)) < 2**64)

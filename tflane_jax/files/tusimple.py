@@ -5,7 +5,6 @@ Format: README of github.com/TuSimple/tusimple-benchmark, doc/lane_detection.
 
 from __future__ import annotations
 
-import reprlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from jaxtyping import Float
 
 from tflane_jax.errors import UserError
 from tflane_jax.files.fields import is_text, items, member, numbers, parse_json, read_text
+from tflane_jax.files.wording import named, shown
 
 NO_POINT = -2.0
 """x of a row in which a lane has no point."""
@@ -63,6 +63,21 @@ def read_truth(path: Path) -> dict[str, RowLanes]:
     return found
 
 
+def read_truth_once(path: Path) -> dict[str, RowLanes]:
+    """Return the labelled lanes as `read_truth`; raises UserError also for a lane that an image has twice.
+
+    One prediction would match both, and FP would be negative. Lanes without a point are exempt: the official labels
+    have images with several.
+    """
+    found = read_truth(path)
+    for one in found.values():
+        first: dict[bytes, int] = {}
+        for i, x in enumerate(one.x):
+            if (x >= 0.0).any() and first.setdefault(x.tobytes(), i) != i:
+                raise UserError(f"{one.place}: lanes[{i}] is lanes[{first[x.tobytes()]}] once more: keep one of them")
+    return found
+
+
 def _records(path: Path) -> list[tuple[str, Any, str]]:
     """Return image, record and place of every line."""
     text = read_text(path, "file of JSON lines")
@@ -76,11 +91,11 @@ def _records(path: Path) -> list[tuple[str, Any, str]]:
         record = parse_json(line.strip(), where, "JSON record", once=True)
         name = member(record, "raw_file", where)
         if not is_text(name) or not name:
-            raise UserError(f"{where}: raw_file is {reprlib.repr(name)}, expected the path of an image")
+            raise UserError(f"{where}: raw_file is {shown(name)}, expected the path of an image")
         if name in first:
-            raise UserError(f"{where}: {name} is there twice, first in line {first[name]}")
+            raise UserError(f"{where}: {named(name)} is there twice, first in line {first[name]}")
         first[name] = number
-        records.append((name, record, f"{where} ({name})"))
+        records.append((name, record, f"{where} ({named(name)})"))
     return records
 
 

@@ -16,7 +16,8 @@ from jaxtyping import Float
 
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import write_text
-from tflane_jax.files.fields import items, member, numbers, parse_json, read_text, shown, whole_number
+from tflane_jax.files.fields import items, member, numbers, parse_json, read_text, whole_number
+from tflane_jax.files.wording import shown
 from tflane_jax.geometry import invert_pose, transform_points
 from tflane_jax.markers.store import MarkerStore, StoredMarker
 from tflane_jax.scene.marker_patterns import BOARD_SIZES

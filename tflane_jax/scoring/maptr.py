@@ -17,7 +17,8 @@ import numpy as np
 
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import replacing
-from tflane_jax.files.fields import is_text, items, load_file, member, numbers, scores, shown, whole_number
+from tflane_jax.files.fields import is_text, items, load_file, member, numbers, scores, whole_number
+from tflane_jax.files.wording import named, shown
 from tflane_jax.metrics.map_matching import LINE_CLASSES, Dims, MapDetections, MapTruth
 
 # Metres from the vehicle: no line of a local map is so far away.
@@ -48,13 +49,15 @@ def read_truth(path: Path, dims: Dims = 2) -> dict[str, MapTruth]:
 
     Raises:
         UserError: it names file, sample and field; also for points with other coordinates, whose numbers would be those
-            of another protocol.
+            of another protocol, and for a line that is there twice.
     """
     types: _Types = {}
-    return {
-        token: MapTruth(*_lines(vectors, where, 2, dims, types), visibility=_visibility(vectors, where))
-        for token, vectors, where in _samples(path, "GTs")
-    }
+    frames = {}
+    for token, vectors, where in _samples(path, "GTs"):
+        points, classes = _lines(vectors, where, 2, dims, types)
+        _check_once(points, classes, where)
+        frames[token] = MapTruth(points, classes, visibility=_visibility(vectors, where))
+    return frames
 
 
 def write_predictions(path: Path, frames: Iterable[tuple[str, MapDetections]]) -> Path:
@@ -87,7 +90,7 @@ def _samples(path: Path, field: str) -> list[tuple[str, Any, str]]:
         token = member(record, "sample_token", f"{path}: {field}[{i}]")
         if not is_text(token) or not token:
             raise UserError(f"{path}: {field}[{i}].sample_token is {shown(token)}, expected a text")
-        where = f"{path}, sample {token}"
+        where = f"{path}, sample {named(token)}"
         if token in seen:
             raise UserError(f"{where} is there twice")
         seen.add(token)
@@ -124,6 +127,18 @@ def _lines(vectors: Any, where: str, least: int, dims: Dims, types: _Types) -> t
         points.append(line)
         classes.append(LINE_CLASSES.index(name))
     return points, np.array(classes, np.int64)
+
+
+def _check_once(points: list[np.ndarray], classes: np.ndarray, where: str) -> None:
+    """Raise UserError if a line is there twice, of which one detection finds only one.
+
+    Centerlines are exempt: paths that part outside of the map's range are the same within it.
+    """
+    first: dict[tuple[int, bytes], int] = {}
+    for i, (line, number) in enumerate(zip(points, classes.tolist(), strict=True)):
+        before = first.setdefault((number, line.tobytes()), i)
+        if before != i and LINE_CLASSES[number] != "centerline":
+            raise UserError(f"{where}: vectors[{i}] is vectors[{before}] once more: keep one of them")
 
 
 def _check_type(vector: Any, name: str, at: str, types: _Types) -> None:

@@ -17,7 +17,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from tflane_jax.errors import UserError
-from tflane_jax.files.fields import choices, fractions, items, load_file, member, scores, shown
+from tflane_jax.files.fields import choices, fractions, items, load_file, member, scores
 from tflane_jax.files.openlane import (
     CENTERLINE,
     DENSE_POINTS,
@@ -30,6 +30,7 @@ from tflane_jax.files.openlane import (
     read_labels,
     read_lines,
 )
+from tflane_jax.files.wording import named, shown
 from tflane_jax.geometry.polylines import resample
 from tflane_jax.metrics.frames import ElementDetections, ElementTruth, LaneDetections, LaneTruth
 from tflane_jax.metrics.lane_segment import Flavour
@@ -46,6 +47,8 @@ from tflane_jax.progress import progress_bar
 _STRIDE = 20
 # Points of the lines of segments and of areas, equally spaced.
 LINE_POINTS, AREA_POINTS = 10, 20
+# Points of a true line: one alone has no direction, and resampling would repeat it.
+_LEAST = 2
 CENTERLINE_POINTS = len(range(0, DENSE_POINTS, _STRIDE))
 
 
@@ -116,7 +119,7 @@ def _annotations(
         segment = file.parent.parent
         key = FrameKey(segment.parent.name, segment.name, stem)
         if key in origin:
-            raise UserError(f"{path}: frame {key} is there twice: {origin[key]} and {file}")
+            raise UserError(f"{path}: frame {named(key)} is there twice: {origin[key]} and {file}")
         origin[key] = file
         frames[key] = parse(member(load_file(file), "annotation", str(file)), str(file))
     return frames
@@ -136,7 +139,7 @@ def _by_frame(records: Mapping[Any, Any], field: str, path: Path, parse: _Parse[
     frames = {}
     for identifier, record in records.items():
         key = as_identifier(identifier, str(path))
-        where = f"{path}, frame {key}"
+        where = f"{path}, frame {named(key)}"
         if key in frames:
             raise UserError(f"{where} is there twice: once with numbers in its name, once with texts")
         frames[key] = parse(member(record, field, where), where)
@@ -144,7 +147,7 @@ def _by_frame(records: Mapping[Any, Any], field: str, path: Path, parse: _Parse[
 
 
 def _truth(record: Any, where: str, names: FieldNames) -> LaneTruth:
-    points = read_lines(record, names.lanes, names.line, where)
+    points = read_lines(record, names.lanes, names.line, where, _LEAST)
     boxes, attributes = _elements(record, where)
     _check_ids(record, (names.lanes, "traffic_element"), where)
     lane_lane, lane_element = (
@@ -179,17 +182,15 @@ def _detections(record: Any, where: str, names: FieldNames) -> LaneDetections:
 
 def _segment_truth(record: Any, where: str, flavour: Flavour) -> SegmentTruth:
     lanes = _truth(record, where, SEGMENT)
-    points, categories = read_areas(record, where)
+    points, categories = read_areas(record, where, _LEAST)
     _check_ids(record, ("area",), where)
     if flavour == "LaneSegNet":
         points = [
             _long_sides(line) if c == CROSSING and len(line) == 5 else line
             for line, c in zip(points, categories, strict=True)
         ]
-    center, left, right = (
-        [_with_points(line, LINE_POINTS) for line in lines]
-        for lines in (lanes.points, *(read_lines(record, SEGMENT.lanes, f"{side}_laneline", where) for side in _SIDES))
-    )
+    sides = (read_lines(record, SEGMENT.lanes, f"{side}_laneline", where, _LEAST) for side in _SIDES)
+    center, left, right = ([_with_points(line, LINE_POINTS) for line in lines] for lines in (lanes.points, *sides))
     areas = AreaTruth([_with_points(line, AREA_POINTS) for line in points], categories)
     return SegmentTruth(replace(lanes, points=center), left, right, areas, *_types(record, where))
 

@@ -19,8 +19,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tflane_jax.errors import UserError
-from tflane_jax.files.fields import choices, fractions, is_text, items, line_points, load_file, member, scores, shown
+from tflane_jax.files.fields import choices, fractions, is_name, is_time, items, line_points, load_file, member, scores
 from tflane_jax.files.npz import read_npz
+from tflane_jax.files.wording import named, shown
 from tflane_jax.metrics.frames import LaneDetections, LaneTruth
 
 SUFFIXES = (".npz", ".json")
@@ -64,20 +65,20 @@ def _frames(path: Path) -> Iterator[tuple[PlainKey, Any, str]]:
         at = f"{path}: frames[{i}]"
         key = PlainKey(_scene(member(record, "scene", at), at), _time(member(record, "timestamp_ns", at), at))
         if key in seen:
-            raise UserError(f"{path}: frame {key} is there twice")
+            raise UserError(f"{path}: frame {named(key)} is there twice")
         seen.add(key)
-        yield key, record, f"{path}, frame {key}"
+        yield key, record, f"{path}, frame {named(key)}"
 
 
 def _scene(value: Any, where: str) -> str:
-    if isinstance(value, bool) or not (is_text(value) or isinstance(value, (int, np.integer))):
+    if not is_name(value):
         raise UserError(f"{where}: scene is {shown(value)}, expected a text")
     return str(value)
 
 
 def _time(value: Any, where: str) -> str:
     """Return a time as the digits of its nanoseconds."""
-    digits = isinstance(value, str) and value.strip().isascii() and value.strip().isdigit()
+    digits = isinstance(value, str) and value.strip().isascii() and is_time(value.strip())
     whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
     if not (digits or (whole and abs(int(value)) < 2**63)):
         raise UserError(f"{where}: timestamp_ns is {shown(value)}, expected whole nanoseconds")

@@ -11,7 +11,7 @@ from typing import Any
 
 from tflane_jax.errors import UserError
 from tflane_jax.files import tusimple
-from tflane_jax.files.fields import PICKLE_SUFFIXES
+from tflane_jax.files.fields import PICKLE_SUFFIXES, check_there
 from tflane_jax.files.openlane import FrameKey
 from tflane_jax.metrics.f_score import CenterlineFScore
 from tflane_jax.metrics.groups import ByDistance, GroupedMetrics, LaneMetrics
@@ -64,6 +64,8 @@ class ScoringProtocol:
 
         Of OpenLane-V2's folder, the splits that are predicted are read: that of the test has no annotations.
         """
+        for path in (predictions, truth):
+            check_there(path)
         found = self._read(self.read_predictions, predictions, "predictions")
         splits = {key.split for key in found if isinstance(key, FrameKey)}
         read = partial(self.read_truth, splits=splits) if splits and truth.is_dir() else self.read_truth
@@ -71,7 +73,10 @@ class ScoringProtocol:
 
     def _read(self, read: Callable[[Path], Mapping[Any, Any]], path: Path, side: Side) -> Mapping[Any, Any]:
         try:
-            return read(path)
+            frames = read(path)
+            if not frames:
+                raise UserError(f"{path} is empty: it has no frames")
+            return frames
         except UserError as error:
             formats = {name: protocol.formats for name, protocol in PROTOCOLS.items()}
             raise UserError(f"{error}{hint(path, side, self.formats, formats)}") from None
@@ -146,7 +151,7 @@ def _maptr(sampling: Sampling, measure: Measure = "chamfer", dims: Dims = 2) -> 
 def _tusimple(time_limit: float) -> ScoringProtocol:
     return ScoringProtocol(
         read_predictions=tusimple.read_predictions,
-        read_truth=tusimple.read_truth,
+        read_truth=tusimple.read_truth_once,
         scene_of=lambda image: image.rpartition("/")[0],
         no_scenes=tusimple.NO_DRIVES,
         metrics=partial(TuSimpleMetrics, time_limit),

@@ -8,10 +8,12 @@ from typing import Any
 import numpy as np
 
 from tflane_jax.files.tusimple import ROWS, RowLanes
-from tflane_jax.metrics.frames import LaneDetections, LaneTruth, Lines
+from tflane_jax.files.wording import named
+from tflane_jax.metrics.frames import ElementDetections, ElementTruth, LaneDetections, LaneTruth, Lines
 from tflane_jax.metrics.map_matching import MapDetections, MapTruth
 from tflane_jax.metrics.segment_matching import SegmentDetections, SegmentTruth
 from tflane_jax.metrics.tusimple import LSTR_TIME_LIMIT, MORE_LANES
+from tflane_jax.scoring.columns import columns
 from tflane_jax.scoring.openlane_v2 import AREA_POINTS, CENTERLINE_POINTS, LINE_POINTS
 
 Remarks = Callable[[Mapping[Any, Any], Mapping[Any, Any]], list[str]]
@@ -26,11 +28,13 @@ def no_remarks(predictions: Mapping[Any, Any], truth: Mapping[Any, Any]) -> list
 
 
 def centerlines(predictions: Mapping[Any, LaneDetections], truth: Mapping[Any, LaneTruth]) -> list[str]:
-    """Return remarks on centerlines: other numbers of points than the official one, other units."""
+    """Return remarks on centerlines and traffic elements: numbers of points and units other than the official ones."""
     return [
         *_other_counts("predicted centerlines", _lines(predictions, lambda one: one.points), CENTERLINE_POINTS),
         *_other_counts("true centerlines", _lines(truth, lambda one: one.points), CENTERLINE_POINTS),
         *units(predictions, truth),
+        *_boxes("predicted", [one.elements for one in predictions.values()]),
+        *_boxes("true", [one.elements for one in truth.values()]),
     ]
 
 
@@ -43,7 +47,7 @@ def units(
 
 
 def segments(predictions: Mapping[Any, SegmentDetections], truth: Mapping[Any, SegmentTruth]) -> list[str]:
-    """Return remarks on lane segments and areas; those of the truth have been resampled."""
+    """Return remarks on lane segments, areas and traffic elements; true lines have been resampled."""
     parts: dict[str, Callable[[SegmentDetections], Lines]] = {
         "centerlines of predicted segments": lambda one: one.lanes.points,
         "left lines of predicted segments": lambda one: one.left,
@@ -52,12 +56,21 @@ def segments(predictions: Mapping[Any, SegmentDetections], truth: Mapping[Any, S
     counts = [_other_counts(name, _lines(predictions, of), LINE_POINTS) for name, of in parts.items()]
     areas = _other_counts("predicted areas", _lines(predictions, lambda one: one.areas.points), AREA_POINTS)
     units = _units(_lines(predictions, lambda one: one.lanes.points), _lines(truth, lambda one: one.lanes.points))
-    return [*(remark for remarks in counts for remark in remarks), *areas, *units]
+    boxes = [
+        *_boxes("predicted", [one.lanes.elements for one in predictions.values()]),
+        *_boxes("true", [one.lanes.elements for one in truth.values()]),
+    ]
+    return [*(remark for remarks in counts for remark in remarks), *areas, *units, *boxes]
 
 
 def images(predictions: Mapping[Any, RowLanes], truth: Mapping[Any, RowLanes], time_limit: float) -> list[str]:
-    """Return remarks on images that count as without lanes, and on labels at other rows; the limit is milliseconds."""
-    return [*_slow(predictions, time_limit), *_too_many(predictions, truth), *_other_rows(truth)]
+    """Return remarks on images that count as without lanes, on other rows and on other columns; the limit: ms."""
+    return [
+        *_slow(predictions, time_limit),
+        *_too_many(predictions, truth),
+        *_other_rows(truth),
+        *columns(predictions, truth),
+    ]
 
 
 def nothing_near(
@@ -115,7 +128,7 @@ def _other_counts(what: str, frames: Mapping[Any, Lines], count: int) -> list[st
     """Return a remark on lines that have not the official number of points, which the distances presuppose."""
     total = sum(map(len, frames.values()))
     other = [
-        f"frame {key}, number {i}: {len(line)}"
+        f"frame {named(key)}, number {i}: {len(line)}"
         for key, lines in frames.items()
         for i, line in enumerate(lines)
         if len(line) != count
@@ -138,6 +151,23 @@ def _units(predictions: Mapping[Any, Lines], truth: Mapping[Any, Lines]) -> list
     ]
 
 
+def _boxes(side: str, frames: Iterable[ElementDetections | ElementTruth | None]) -> list[str]:
+    """Return a remark on traffic elements of which not one can be in the image."""
+    every = [np.asarray(one.boxes, np.float64) for one in frames if one is not None and len(one.boxes)]
+    if not every:
+        return []
+    boxes = np.concatenate(every)
+    if (boxes[:, 0] >= boxes[:, 1]).any(-1).all():
+        fault = "have no area"
+    elif boxes.min() >= 0.0 and boxes.max() <= 1.0:
+        fault = "lie between 0 and 1, as if normalised"
+    elif (boxes[:, 1] <= 0.0).any(-1).all():
+        fault = "lie left of the image or above it"
+    else:
+        return []
+    return [f"all {len(boxes)} boxes of {side} traffic elements {fault}: are their corners pixels of the image?"]
+
+
 def _extent(frames: Iterable[Lines]) -> float | None:
     """Return how far lines reach from the origin, median over frames that have any; None without extent."""
     reach = [max(float(np.abs(np.asarray(line)[:, :2]).max()) for line in lines) for lines in frames if len(lines)]
@@ -146,4 +176,4 @@ def _extent(frames: Iterable[Lines]) -> float | None:
 
 
 def _named(names: Sequence[Any]) -> str:
-    return ", ".join(map(str, names[:_NAMED])) + (", ..." if len(names) > _NAMED else "")
+    return ", ".join(map(named, names[:_NAMED])) + (", ..." if len(names) > _NAMED else "")

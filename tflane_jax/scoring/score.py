@@ -13,6 +13,7 @@ from typing import Any, Protocol, Self
 import numpy as np
 
 from tflane_jax.errors import UserError
+from tflane_jax.files.wording import named
 from tflane_jax.progress import progress_bar
 
 _LEVEL = 0.95
@@ -108,7 +109,7 @@ def score(
         try:
             scenes.setdefault(scene_of(key), make()).update(predictions[key], truth[key])
         except UserError as error:
-            raise UserError(f"frame {key}: {error}") from None
+            raise UserError(f"frame {named(key)}: {error}") from None
     return Scored(dict(sorted(scenes.items())))
 
 
@@ -140,7 +141,7 @@ def _check_frames(predictions: Mapping[Hashable, Any], truth: Mapping[Hashable, 
     ):
         lost = ours.keys() - other.keys()
         if lost:
-            shown = ", ".join(f"{name:.80}" for name in sorted(map(str, lost))[:3])
+            shown = ", ".join(f"{named(name):.80}" for name in sorted(map(str, lost))[:3])
             more = f" and {len(lost) - 3} more" if len(lost) > 3 else ""
             problems.append(f"{len(lost)} of {len(ours)} frames are {what}: {shown}{more} ({remedy})")
     if prefix := _prefix(predictions, truth):
@@ -163,7 +164,7 @@ def _prefix(ours: Mapping[Hashable, Any], other: Mapping[Hashable, Any]) -> str:
     if not all(name.startswith(before) and name.removeprefix(before) in other for name in names):
         return ""
     slashes = "backslashes" if any("\\" in str(name) for name in ours) else ""
-    return " and ".join(filter(None, [f"the prefix {before}" if before else "", slashes]))
+    return " and ".join(filter(None, [f"the prefix {named(before)}" if before else "", slashes]))
 
 
 def _merged(accumulators: list[Accumulator]) -> Accumulator:

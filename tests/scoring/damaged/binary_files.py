@@ -30,7 +30,7 @@ _POINTS = {
     "nested": (np.zeros((1, 11, 3)), r"has shape \(1, 11, 3\)"),
     "too deep": (deep(80), "expected|shape"),
     "uneven": ([[0, 0, 0], [1, 0]], "rows of one length: row 0 is of 3, row 1 of 2"),
-    "empty": (np.zeros((0, 3)), "is empty: a line has at least one point"),
+    "empty": (np.zeros((0, 3)), "is empty: a line has at least (one point|2 points)"),
     "records": (np.zeros(11, [("x", "f4")]), "expected numbers"),
     "of a city": (np.full((11, 3), 4e6), "expected metres from the vehicle"),
     "by name": ({"x": 1}, "of type dict"),
@@ -50,6 +50,8 @@ def _openlane(form, lanes, line, lane_lane, lane_element):
             ("frame is a list", put(*top, KEYS[1], []), f"{where} is of type list, expected a mapping"),
             ("key is text", _rename(top, "val/10000/150"), "'val/10000/150' is no frame, expected"),
             ("key of two", _rename(top, ("val", "10000")), r"\('val', '10000'\) is no frame"),
+            ("key of a path", _rename(top, ("./val", "10000", "150")), r"'150'\) is no frame, expected .* without '/'"),
+            ("key with codes", _rename(top, ("val\x1b[31m\n", "10000", "150")), r"'val\\x1b\[31m\\n/10000/150'"),
             ("key of nothing", _rename(top, ("val", "10000", None)), "is no frame, expected .*as texts or numbers"),
             ("key of a huge number", _rename(top, ("val", "10000", LONGEST)), "is no frame, expected"),
             ("key of half a character", _rename(top, ("val", "\ud800", "150")), r"'\\ud800', '150'\) is no frame"),
@@ -81,6 +83,7 @@ def _openlane(form, lanes, line, lane_lane, lane_element):
             ("width and height", [[100, 100], [20, 30]], "width and height in place of the second"),
             ("flat", [0, 0, 10, 10], r"has shape \(4,\), expected \(2, 2\)"),
             ("NaN", [[0, 0], [10, np.nan]], r"holds nan at \[1, 1\]"),
+            ("too wide", [[0, 0], [1e200, 10]], r"holds 1e\+200 at \[1, 0\]: beyond 100000 in size"),
             ("complex", np.ones((2, 2), complex), "complex numbers"),
             ("null", None, "missing"),
         ):
@@ -136,6 +139,9 @@ def _openlane(form, lanes, line, lane_lane, lane_element):
             lane["visibility"] = 1.5
 
     yield Case(form, "truth", "visibility above 1", "visibility: number 0 is 1.5, expected 0 to 1", above)
+    one = put(KEYS[1], "annotation", lanes, 1, line, np.zeros((1, 3)))
+    single = rf"{lanes}\[1\].{line} has one point: a line has at least 2"
+    yield Case(form, "truth", f"{line} of one point", single, one)
     half = put(KEYS[1], "annotation", lane_lane, np.array([[0, 0.7], [0, 0]]))
     yield Case(form, "truth", "probabilities for edges", r"holds 0.7 at \[0, 1\], expected 0 or 1", half)
 
@@ -175,6 +181,9 @@ def _segments():
             at = rf"{where}: lane_segment\[1\].{line}"
             lost = rf"{where}: lane_segment\[1\] lacks the entry '{line}'"
             yield Case("segment", side, f"no {line}", lost, drop(*frame, "lane_segment", 1, line))
+            if side == "truth":
+                one = put(*frame, "lane_segment", 1, line, np.zeros((1, 3)))
+                yield Case("segment", side, f"{line} of one point", f"{at} has one point: a line has", one)
             for name in ("NaN", "complex", "flat", "empty", "null"):
                 value, message = _POINTS[name]
                 yield Case(
@@ -184,10 +193,13 @@ def _segments():
         yield Case("segment", side, "type of one line", r"lane_segment\[1\] lacks the entry 'left_laneline_type'", some)
         kind = put(*frame, "lane_segment", 1, "left_laneline_type", 5)
         yield Case("segment", side, "another type", "left_laneline_type is 5, expected .* from 0 to 2", kind)
+        point = put(*frame, "area", 0, "points", np.zeros((1, 3)))
+        one_point = ("area of one point", point, r"area\[0\].points has one point: a line has at least 2")
         for name, change, message in (
             ("no areas", drop(*frame, "area"), f"{where} lacks the entry 'area'"),
             ("another category", put(*frame, "area", 0, "category", 3), r"area\[0\].category is 3, expected .* 1 to 2"),
             ("no category", drop(*frame, "area", 0, "category"), r"area\[0\] lacks the entry 'category'"),
+            *([one_point] if side == "truth" else []),
             ("flat area", put(*frame, "area", 0, "points", np.zeros((20, 2))), r"area\[0\].points has shape \(20, 2\)"),
         ):
             yield Case("segment", side, name, message, change)
@@ -208,7 +220,7 @@ def _pickles():
             ("not a pickle", lambda b: b"{'results': {}}", "no pickle file, or it is damaged"),
             ("code", lambda b: pickle.dumps(Evil()), "is refused: it is a pickle that names"),
             ("a list", lambda b: pickle.dumps([1, 2]), "is of type list, expected a mapping"),
-            ("no frames", lambda b: pickle.dumps({"results": {}}), "frame|looks like|no frames"),
+            ("no frames", lambda b: pickle.dumps({"results": {}}), "frame|looks like|empty: it has no frames"),
             ("nested too deep", lambda b: deep_pickle, "is of type list, expected a mapping"),
         ):
             yield Case("centerline", side, name, message, after=after)

@@ -20,7 +20,7 @@ def _broken(form, side, record):
     """Return what can happen to any JSON file; `record` is a text in it."""
     other = encoded("centerline", "truth")
     for name, after, message in (
-        ("empty", lambda b: b"", "no JSON|lacks|no frames|empty"),
+        ("empty", lambda b: b"", f"{side}.json is (no JSON|empty: it has no frames)"),
         ("cut off", lambda b: b[: len(b) // 2], "no JSON (file|record)"),
         ("not text", lambda b: other, "not text"),
         ("two-byte characters", lambda b: b.decode().encode("utf-16"), "not text"),
@@ -53,6 +53,7 @@ def _tusimple():
             "a lane of points": (put(1, "lanes", 1, [[1, 240]] * 4), rf"{where}: lanes\[1\] has shape \(4, 2\)"),
             "a far column": (put(1, "lanes", 1, 2, 1e30), rf"{where}: lanes\[1\] holds 1e\+30 at \[2\]: beyond"),
             "fractions of the width": (_normalised, rf"{side}.json: every x .* 0 and 1: multiply"),
+            "a name with codes": (_escaped, r"line 2 \('a\\x1b\[31m\\n'\): lanes"),
             "other frames": (put(1, "raw_file", "clips/0601/1/20.jpg"), r"1 of 3 frames are .*clips/0601/1/20.jpg"),
         }
         for name, (value, said) in _BAD_NUMBERS.items():
@@ -87,10 +88,16 @@ def _tusimple():
     ):
         damage = drop(1, "h_samples") if rows is ... else put(1, "h_samples", rows)
         yield Case("tusimple", "truth", f"rows are {name}", f"truth.json, line 2 .*{message}", damage)
+    same = r"truth.json, line 2 .*: lanes\[2\] is lanes\[1\] once more: keep one of them"
+    yield Case("tusimple", "truth", "a lane twice", same, repeat(1, "lanes", 1))
     shifted = r"line 2 .*: h_samples are 250 to 280, those of the truth 240 to 270"
     yield Case("tusimple", "predictions", "shifted rows", shifted, put(1, "h_samples", [250, 260, 270, 280]))
     none = r"line 2 .*: h_samples are empty, those of the truth 240 to 270"
     yield Case("tusimple", "predictions", "no rows, no lanes", none, _without_rows)
+
+
+def _escaped(records):
+    records[1] |= {"raw_file": "a\x1b[31m\n", "lanes": None}
 
 
 def _without_rows(records):
@@ -127,6 +134,7 @@ def _maptr():
             ("samples by token", put(field, {"s0": []}), f"{field} is of type dict, expected a list"),
             ("a sample is a list", put(field, 1, []), rf"{field}\[1\] is of type list, expected a mapping"),
             ("a sample twice", repeat(field, 1), "sample s1 is there twice"),
+            ("a token with codes", put(field, 1, "sample_token", "s1 \n"), r"1 of 3 frames are .*: 's1 \\n'"),
             ("a sample lost", drop(field, 1), "1 of . frames are .*: s1"),
             ("no token", drop(field, 1, "sample_token"), rf"{field}\[1\] lacks the entry 'sample_token'"),
             ("token is null", put(field, 1, "sample_token", None), rf"{field}\[1\].sample_token is None"),
@@ -162,7 +170,8 @@ def _maptr():
             yield Case("maptr", side, f"a point is {name}", rf"{where}.pts.*({said})", put(*first, "pts", 1, 0, value))
     level = ("results", 1, "vectors", 1, "confidence_level")
     for name, value, message in (
-        ("above 1", 1.5, "number 1 is 1.5, expected 0 to 1"),
+        ("above 1", 1.5, r"number 1 is 1.5, expected 0 to 1$"),
+        ("above 1 by rounding", 1 + 1e-12, r"number 1 is 1.000000000001, expected 0 to 1 \(a rounding error"),
         ("a logit", -3.2, r"number 1 is -3.2, expected 0 to 1 \(apply the sigmoid first\)"),
         ("true", True, "holds a truth value"),
         ("a word", "high", "text"),
@@ -176,6 +185,8 @@ def _maptr():
     yield Case("maptr", "predictions", "no score", r"vectors\[1\] lacks the entry 'confidence_level'", drop(*level))
     one = put("GTs", 1, "vectors", 0, "pts", [[0.0, 0.0]])
     yield Case("maptr", "truth", "a line of one point", r"pts has shape \(1, 2\), expected .* at least 2", one)
+    same = r"truth.json, sample s1: vectors\[2\] is vectors\[0\] once more: keep one of them"
+    yield Case("maptr", "truth", "a line twice", same, repeat("GTs", 1, "vectors", 0))
     seen = put("GTs", 1, "vectors", 0, "visibility", 0.5)
     yield Case("maptr", "truth", "visibility of one line", r"vectors\[1\] lacks the entry 'visibility'", seen)
 
@@ -194,9 +205,20 @@ def _plain():
             ("no scene", drop(*frame, "scene"), r"frames\[1\] lacks the entry 'scene'"),
             ("scene is a list", put(*frame, "scene", ["a"]), r"frames\[1\]: scene is \['a'\], expected a text"),
             ("scene is half a character", put(*frame, "scene", "\udfff"), r"scene is '\\udfff', expected a text"),
+            (
+                "scene of many digits",
+                put(*frame, "scene", 10**300),
+                "scene is an integer of many digits, expected a text",
+            ),
+            (
+                "scene with codes",
+                put(*frame, "scene", "a\x1b[31m\n"),
+                r"1 of 3 frames are .*: 'a\\x1b\[31m\\n at 2 ns'",
+            ),
             ("scene is null", put(*frame, "scene", None), r"frames\[1\]: scene is None, expected a text"),
             ("time is a fraction", put(*frame, "timestamp_ns", 1.5), "timestamp_ns is 1.5, expected whole nanoseconds"),
             ("time is huge", put(*frame, "timestamp_ns", HUGE), "timestamp_ns is an integer of many digits"),
+            ("time of 6000 digits", put(*frame, "timestamp_ns", "9" * 6000), "timestamp_ns is '9+.*, expected whole"),
             ("time is a word", put(*frame, "timestamp_ns", "now"), "timestamp_ns is 'now', expected whole"),
             ("no points", drop(*frame, "points"), f"{where} lacks the entry 'points'"),
             ("points are text", put(*frame, "points", "none"), f"{where}: points is of type str"),

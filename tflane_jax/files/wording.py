@@ -1,0 +1,52 @@
+"""Values, names and numbers of untrusted files as messages show them: short, and on one line."""
+
+from __future__ import annotations
+
+import reprlib
+from typing import Any
+
+import numpy as np
+
+_LONGEST_NAME = 200
+
+
+def shown(value: Any) -> str:
+    """Return at most 40 characters of a value for a message, whatever it is.
+
+    Python refuses to write integers of more than 4300 digits, alone or in a list.
+    """
+    value = value.item() if isinstance(value, np.generic) else value
+    if isinstance(value, int) and abs(value) >= 2**63:
+        return "an integer of many digits"
+    try:
+        return f"{reprlib.repr(value):.40}"
+    except (RecursionError, ValueError):
+        return f"a value {kind(value)}"
+
+
+def kind(value: Any) -> str:
+    """Return of which type a value is, as the end of a sentence."""
+    return "missing (null)" if value is None else f"of type {type(value).__name__}"
+
+
+def place(index: tuple[int, ...]) -> str:
+    """Return where an array holds a number, as the end of a sentence; "" for an array that is one number."""
+    return f" at {list(index)}" if index else ""
+
+
+def shape_text(shape: tuple[int | None, ...]) -> str:
+    """Return an expected shape; None is any size."""
+    return "(" + ", ".join("any" if size is None else str(size) for size in shape) + ("," * (len(shape) == 1)) + ")"
+
+
+def named(name: Any) -> str:
+    """Return the name of a frame, scene or image; in quotes where it has line breaks, escape codes or outer spaces."""
+    text = str(name)
+    plain = text.isprintable() and text == text.strip() and text
+    return f"{text if plain else repr(text):.{_LONGEST_NAME}}"
+
+
+def digits(number: np.floating | np.integer) -> str:
+    """Return a number with six digits, or with as many as tell it from its neighbours."""
+    short = f"{number:g}"
+    return short if type(number)(short) == number else str(number)

@@ -20,10 +20,13 @@ from tflane_jax.cli import build_parser
 from tflane_jax.config import RunConfig, load_config
 from tflane_jax.config_overrides import apply_overrides
 from tflane_jax.datasets import sources
+from tflane_jax.datasets.base import ExampleConfig
+from tflane_jax.datasets.procedural import STREET_EXAMPLE
 from tflane_jax.errors import UserError
 from tflane_jax.layers.batch_norm import STATISTICS
 from tflane_jax.runs import check_origin
 from tflane_jax.scene import stack_examples
+from tflane_jax.tasks.fit import check_settings_fit
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 
 PAGES = {
@@ -176,3 +179,14 @@ def test_the_examples_of_the_page_are_valid():
     assert (arrays.lanes.valid.sum(), made.lanes.valid.sum()) == (2, 1)
     for example in (arrays, made):
         assert example.traffic_flow.valid.any(1).sum() == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "example"),
+    [("tf_lane/toponet", "ExampleConfig()"), ("tf_lane/toponet_tfm", "ExampleConfig()")]
+    + [(f"tf_lane/{name}", "STREET_EXAMPLE") for name in ("toponet:street", "toponet_tfm:street_bev")],
+)
+def test_the_box_that_the_page_names_is_that_of_the_configuration(name, example):
+    assert f"`{example}`" in PAGES["docs/your_data.md"]
+    box = {"ExampleConfig()": ExampleConfig(), "STREET_EXAMPLE": STREET_EXAMPLE}[example]
+    check_settings_fit(load_config(name).task.model, box, image_scale=None)

@@ -12,14 +12,15 @@ import pytest
 from tests.test_cli import CONFIG, use_fakes
 from tflane_jax.cli import main
 from tflane_jax.commands import submit
-from tflane_jax.commands.sources import data_name
-from tflane_jax.config import LogData, NuScenesData, RunConfig, WorldData
+from tflane_jax.commands.sources import data_name, model_title
+from tflane_jax.config import LogData, NuScenesData, RunConfig, WorldData, load_config
 from tflane_jax.datasets.base import ExampleConfig, MarkerConfig
 from tflane_jax.datasets.data_source import Choice
 from tflane_jax.datasets.map_lines import MapLinesConfig
 from tflane_jax.datasets.nuscenes_scenes import SceneFileConfig
 from tflane_jax.datasets.sources import named_source
 from tflane_jax.errors import UserError
+from tflane_jax.runs import Run
 from tflane_jax.world.cameras.ring import CameraRigConfig
 
 PRESETS = {
@@ -106,6 +107,18 @@ def test_a_preset_has_the_priors_and_the_truth_that_the_model_reads(name):
 def test_other_worlds_folders_and_splits_have_other_names(source, given, name):
     options = {"data": None, "root": None, "split": None, "default_split": "test"} | given
     assert data_name(source, argparse.Namespace(**options)) == name
+
+
+@pytest.mark.parametrize(
+    ("folder", "config", "title"),
+    [
+        ("runs/tfm", "tf_lane/toponet_tfm", "tfm, step 3"),
+        ("runs/runs/b1d907781b71ba6b", "tf_lane/toponet_tfm", "TopoNet + traffic flow, step 3"),
+        ("runs/runs/b1d907781b71ba6b", "gtn_lane/gtn", "Lstr + GtnEncoder, step 3"),
+    ],
+)
+def test_pictures_of_a_run_in_a_store_name_its_model(folder, config, title):
+    assert model_title(Run(folder, load_config(config), 3, ())) == title
 
 
 def test_what_only_one_server_takes_is_refused_elsewhere(monkeypatch, tmp_path):

@@ -1,6 +1,7 @@
 """Own parts of a run as subclasses outside the package: they are built, checked, changed by arguments and read back."""
 
 import json
+import re
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -10,6 +11,7 @@ import pytest
 
 from tests.models.cases import BASELINE, CAMERA, make_camera_example, make_example
 from tests.models.toy_prior import CrossingsConfig
+from tests.shared import ROOT
 from tflane_jax.config import RunConfig
 from tflane_jax.config_io import choices, from_json, to_json, with_setting
 from tflane_jax.config_overrides import apply_overrides
@@ -18,6 +20,8 @@ from tflane_jax.limits import Count, check_settings
 from tflane_jax.models.camera_encoder import CameraEncoder, CameraEncoderConfig
 from tflane_jax.models.evidence_encoder import EvidenceEncoderConfig
 from tflane_jax.models.priors import PriorsConfig
+from tflane_jax.models.raster_fusion import TrafficRasterConfig
+from tflane_jax.models.traffic_flow_module import TrafficFlowConfig
 from tflane_jax.run_checks import check_run
 from tflane_jax.scene import Example, Prediction
 from tflane_jax.tasks.lane_graph import LaneGraphTask
@@ -115,6 +119,32 @@ def test_an_own_encoder_of_evidence_is_built():
     params, prediction = shaped(LaneGraphTask(replace(BASELINE, encoder=encoder)), make_example(0))
     assert list(params["encoder"]) == ["plain"]
     assert prediction == shaped(LaneGraphTask(BASELINE), make_example(0))[1]
+
+
+def with_traffic_in_bev(kind: type[EvidenceEncoderConfig]) -> LaneGraphTask:
+    """Return a host with an encoder of a class, and traffic in its BEV features."""
+    traffic = replace(TrafficFlowConfig(), bev=TrafficRasterConfig())
+    encoder = kind(**vars(BASELINE.encoder))
+    return LaneGraphTask(replace(BASELINE, encoder=encoder, priors=PriorsConfig(traffic_flow=traffic)))
+
+
+def test_the_encoder_of_the_page_takes_priors():
+    page = (ROOT / "docs" / "architecture.md").read_text("utf-8")
+    (code,) = [block for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "fuse(" in block]
+    names: dict[str, Any] = {}
+    exec(compile(code, "architecture.md", "exec"), names)
+    task = with_traffic_in_bev(names["PatchEncoderConfig"])
+    params, prediction = shaped(task, make_example(0))
+    assert sorted(params["encoder"]) == ["block_0", "block_1", "patch", "traffic_flow_0"]
+    assert prediction == shaped(LaneGraphTask(BASELINE), make_example(0))[1]
+    encoder, bev = task.model.encoder, make_example(0).bev
+    features, _ = jax.eval_shape(encoder.build().init_with_output, jax.random.key(0), bev)
+    assert features.shape == (bev.shape[0] // encoder.cell, bev.shape[1] // encoder.cell, encoder.dim)
+
+
+def test_an_encoder_that_leaves_priors_out_is_an_error():
+    with pytest.raises(UserError, match=r"PlainEncoder never calls `fuse` of layer 0.*task\.model\.priors"):
+        shaped(with_traffic_in_bev(PlainEncoderConfig), make_example(0))
 
 
 def test_an_own_encoder_of_cameras_is_built():

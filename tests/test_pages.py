@@ -20,11 +20,16 @@ from tflane_jax.cli import build_parser
 from tflane_jax.config import RunConfig, load_config
 from tflane_jax.config_overrides import apply_overrides
 from tflane_jax.datasets import sources
+from tflane_jax.datasets.base import ExampleConfig
+from tflane_jax.datasets.procedural import STREET_EXAMPLE
 from tflane_jax.errors import UserError
 from tflane_jax.layers.batch_norm import STATISTICS
+from tflane_jax.run_checks import check_run
 from tflane_jax.runs import check_origin
 from tflane_jax.scene import stack_examples
+from tflane_jax.tasks.fit import check_settings_fit
 from tflane_jax.tasks.lane_graph import LaneGraphTask
+from tflane_jax.training.schedule import make_optimizer
 
 PAGES = {
     path.relative_to(ROOT).as_posix(): path.read_text("utf-8")
@@ -82,6 +87,14 @@ def test_commands_in_pages_parse():
     assert len(found) > 110, "hardly anything found: has the pattern changed?"
     wrong = {f"{page}: tflane {shlex.join(words)}": said for page, words in found if (said := fault(words))}
     assert wrong == {}
+
+
+def test_the_first_training_of_the_readme_is_not_refused():
+    (words,) = [words for words in commands(PAGES["README.md"]) if "runs/first" in words]
+    options, rest = build_parser().parse_known_args(words)
+    config = apply_overrides(load_config(options.config), rest)
+    check_run(config)
+    make_optimizer(config.optim, config.training.steps)  # refuses a warm-up that does not end
 
 
 @pytest.mark.parametrize(
@@ -176,3 +189,14 @@ def test_the_examples_of_the_page_are_valid():
     assert (arrays.lanes.valid.sum(), made.lanes.valid.sum()) == (2, 1)
     for example in (arrays, made):
         assert example.traffic_flow.valid.any(1).sum() == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "example"),
+    [("tf_lane/toponet", "ExampleConfig()"), ("tf_lane/toponet_tfm", "ExampleConfig()")]
+    + [(f"tf_lane/{name}", "STREET_EXAMPLE") for name in ("toponet:street", "toponet_tfm:street_bev")],
+)
+def test_the_box_that_the_page_names_is_that_of_the_configuration(name, example):
+    assert f"`{example}`" in PAGES["docs/your_data.md"]
+    box = {"ExampleConfig()": ExampleConfig(), "STREET_EXAMPLE": STREET_EXAMPLE}[example]
+    check_settings_fit(load_config(name).task.model, box, image_scale=None)

@@ -36,7 +36,7 @@ from tflane_jax.training.checkpoint import Checkpoints, Manifest, Which
 from tflane_jax.training.fine_tuning import check_origins
 from tflane_jax.training.loop import Draw, TrainingResult, train
 from tflane_jax.training.provenance import add_provenance
-from tflane_jax.training.records import Record
+from tflane_jax.training.records import Record, by_name
 from tflane_jax.training.run_folder import Start, check_start, check_unchanged, claimed, read_config
 from tflane_jax.training.schedule import make_optimizer, scaled_to_batch
 from tflane_jax.training.state import per_seed, state_of
@@ -113,7 +113,7 @@ def _train(config: RunConfig, folder: Path, *, start: Start, progress: bool, dra
         validation: Any = task.load(config.data.source("val"), progress=progress)
 
     def evaluate(params: Params) -> dict[str, float]:
-        return task.evaluate(params, validation, config.evaluation).scores()
+        return task.evaluate(params, validation, config.evaluation).recorded()
 
     return train(
         config.task,
@@ -308,7 +308,7 @@ def evaluate_run(
         values = [one.shown(group) for one in every]
         rows += [{"lanes of": group, "seed": seed, **one} for seed, one in zip(seeds, values, strict=True)]
         if len(seeds) > 1:
-            table = {name: np.array([one[name] for one in values]) for name in values[0]}
+            table = {name: np.array(numbers) for name, numbers in by_name(values).items()}
             rows.append({"lanes of": group, "seed": "mean"} | {k: float(v.mean()) for k, v in table.items()})
             rows.append({"lanes of": group, "seed": "std"} | {k: float(v.std(ddof=1)) for k, v in table.items()})
     columns = task.columns

@@ -1,6 +1,7 @@
 """The list of data sources: a new dataset costs one file and one entry, and no source ignores --split."""
 
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -330,3 +331,18 @@ def test_a_dataset_is_added_from_outside(tmp_path):
     assert main(["data", "check", "--format", "toy", str(tmp_path)]) == 2  # there are no other splits
     with pytest.raises(ValueError, match=r"tflane_jax has a data source tusimple \(TuSimpleData\): choose other names"):
         sources.add_source(replace(toy_source.SOURCE, name="tusimple"))
+
+
+@pytest.mark.usefixtures("unchanged")
+def test_a_source_without_a_check_of_its_folder_is_refused(tmp_path, capsys):
+    sources.add_source(replace(toy_source.SOURCE, check=None))
+    assert main(["data", "check", "--format", "toy", str(tmp_path)]) == 2
+    assert "tflane: --format toy has no check of a folder: choose one of argoverse2, " in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("unchanged")
+def test_the_dataset_of_the_page_is_added():
+    page = (ROOT / "docs" / "architecture.md").read_text("utf-8")
+    (code,) = [block for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "class ToyDataset" in block]
+    exec(compile(code, "architecture.md", "exec"), vars(toy_source) | {"sources": sources})
+    assert sources.named_source("toy").check is not None

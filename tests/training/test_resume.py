@@ -128,3 +128,25 @@ def test_damage_that_would_end_the_run_later_is_named_before_the_first_step(tmp_
     monkeypatch.setattr(loop, "compiled_update", None)
     with pytest.raises(UserError, match=said):
         run(folder, start="resume")
+
+
+def without_best(params):
+    return {"other": score(params)["score"]}
+
+
+def test_an_evaluation_without_the_best_metric_is_told_once_and_leaves_no_best_checkpoint(tmp_path, capsys):
+    for start, steps in (("new", 10), ("resume", 30)):
+        config = dataclasses.replace(CONFIG, steps=steps)
+        run(tmp_path / "run", start=start, config=config, evaluate=without_best)
+    told = [line for line in capsys.readouterr().err.splitlines() if "training.best_metric" in line]
+    assert [line.partition(" (")[0] for line in told] == ["step 10: the evaluation has no score"]
+    checkpoints = Checkpoints(tmp_path / "run" / "checkpoints", best_metric="score")
+    with pytest.raises(UserError, match=r"has the score score \(training\.best_metric\), .*ask for `last`"):
+        checkpoints.find("best")
+
+
+def test_a_score_that_some_seed_lacks_is_not_recorded(tmp_path):
+    evaluations = iter([{"score": 1.0, "error": 2.0}, {"score": 3.0}])
+    config = dataclasses.replace(CONFIG, steps=10, seeds=(0, 1))
+    result = run(tmp_path / "run", config=config, evaluate=lambda params: next(evaluations))
+    assert result.metrics == {"score": 2.0}

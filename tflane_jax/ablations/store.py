@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -76,6 +77,11 @@ def run_key(config: RunConfig, threads: Mapping[str, Any], origin: str | None = 
         config = replace(config, training=replace(config.training, init_from=origin))
     text = json.dumps([_chosen(config), dict(threads), *filter(None, [content])], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:NAME_LENGTH]
+
+
+def is_key(name: str) -> bool:
+    """Return whether a folder has the name that `run_key` gives."""
+    return re.fullmatch(rf"[0-9a-f]{{{NAME_LENGTH}}}", name) is not None
 
 
 def _chosen(config: Any) -> dict[str, Any]:

@@ -90,7 +90,10 @@ def check(options: argparse.Namespace) -> int:
     source = sources.named_source(options.format or _FORMAT)
     if source.check is None:
         names = ", ".join(one.name for one in sources.SOURCES if one.check is not None)
-        raise UserError(f"--format {source.name} is not read from a folder: choose one of {names}")
+        raise UserError(
+            f"--format {source.name} has no check of a folder: choose one of {names}; a dataset of your own gets one "
+            "by `check` of its DataSource"
+        )
     wanted: dict[str, Any] = {} if options.tracks is None else {"tracks": options.tracks}
     if wanted and not source.tracks:
         raise UserError("--tracks belongs to --format openlane-v2: other datasets hold their tracks themselves")

@@ -14,7 +14,7 @@ import jax
 import numpy as np
 
 from tflane_jax.commands.predict_lanes import MOST_DRAWN
-from tflane_jax.commands.sources import chosen_source, make_folder
+from tflane_jax.commands.sources import chosen_source, make_folder, model_title
 from tflane_jax.datasets import sources
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import write_text
@@ -49,7 +49,7 @@ def predict_split(trained: Run, options: argparse.Namespace) -> int:
         predictions.append({"raw_file": name, "lanes": _plain(found), "run_time": 0.0})
     for name, rows in (("predictions.json", predictions), ("truth.json", truths)):
         write_text(options.out / name, "".join(json.dumps(row) + "\n" for row in rows))
-    title, rows = f"{Path(trained.name).name}, step {trained.step}", spread(len(indices), MOST_DRAWN)
+    title, rows = model_title(trained), spread(len(indices), MOST_DRAWN)
     examples, answers = jax.tree.map(lambda leaf: np.asarray(leaf)[rows], (examples, answers))
     names = [dataset.info(indices[row]).scene for row in rows]
     pictures = options.out / "pictures.png"

@@ -37,7 +37,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.special import expit
 
-from tflane_jax.commands.sources import limited_task, make_folder, source_for
+from tflane_jax.commands.sources import limited_task, make_folder, model_title, source_for
 from tflane_jax.commands.views import with_images
 from tflane_jax.datasets import sources
 from tflane_jax.datasets.base import Dataset, FrameInfo
@@ -85,8 +85,7 @@ def predict(trained: Run, options: argparse.Namespace) -> int:
         _save_arrays(options.out / "truth.npz", truth | {name: arrays[name] for name in ("scene", "timestamp_ns")})
     head = {"run": trained.name, "step": trained.step, "seed": trained.config.training.seeds[0]}
     write_json(options.out / "predictions.json", head | {"threshold": options.threshold, "frames": frames})
-    label = f"{Path(trained.name).name}, step {trained.step}"
-    pictures = _draw(options, source, dataset, indices, examples, answer, label)
+    pictures = _draw(options, source, dataset, indices, examples, answer, model_title(trained))
 
     written = ", ".join(["predictions.npz", *(["truth.npz"] if truth else []), "predictions.json", *pictures])
     lanes = sum(len(frame["lanes"]) for frame in frames)

@@ -7,12 +7,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from tflane_jax.ablations.store import is_key
 from tflane_jax.config import RunConfig, load_config
 from tflane_jax.datasets import argoverse2
 from tflane_jax.datasets.base import SPLITS, Split
 from tflane_jax.datasets.data_source import Choice, DataSource
 from tflane_jax.datasets.sources import SOURCES, named_source, source_name, source_names, source_of
 from tflane_jax.errors import UserError
+from tflane_jax.models.host import HostConfig
 from tflane_jax.run_checks import EXAMPLE_NAMES, check_kind
 from tflane_jax.runs import Run, open_run, open_weights
 from tflane_jax.scene import Example, RoadImage
@@ -43,6 +45,20 @@ def opened(options: argparse.Namespace) -> tuple[Run, list[Path]]:
             "published weights"
         )
     return open_run(options.inputs[0], options.checkpoint), options.inputs[1:]
+
+
+def model_title(run: Run) -> str:
+    """Return name and step of a model for pictures: the folder's name, or class and parts of a model in a store."""
+    name = Path(run.name).name
+    if is_key(name):
+        model: Any = run.config.task.model
+        parts = model.priors.configured if isinstance(model, HostConfig) else [_class_name(model.encoder)]
+        name = " + ".join([_class_name(model), *(part.replace("_", " ") for part in parts)])
+    return f"{name}, step {run.step}"
+
+
+def _class_name(config: Any) -> str:
+    return type(config).__name__.removesuffix("Config")
 
 
 def limited_task(run: Run, options: argparse.Namespace) -> Any:

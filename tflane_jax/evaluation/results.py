@@ -92,10 +92,17 @@ class Evaluation:
         return dict(values) if whole else shown_of_part(values)
 
     def scores(self) -> dict[str, float]:
-        """Return the scores by "group/name", without counts. Runs record them and rate checkpoints by them."""
+        """Return the scores by "group/name", without counts."""
+        return self._named(self.groups)
+
+    def recorded(self) -> dict[str, float]:
+        """Return the scores that runs record and rate checkpoints by: those of `scores` that a table shows."""
+        return self._named({group: self.shown(group) for group in self.groups})
+
+    def _named(self, groups: Mapping[str, Mapping[str, float]]) -> dict[str, float]:
         return {
             f"{group}/{name}": value
-            for group, values in self.groups.items()
+            for group, values in groups.items()
             for name, value in values.items()
             if name not in self.counts
         }

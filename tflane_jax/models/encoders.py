@@ -5,6 +5,7 @@ A new encoder is a module, and a subclass of the configuration that has the same
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 from tflane_jax.errors import UserError
@@ -39,8 +40,34 @@ def encode_example(
         hook: how priors change the BEV features of every layer.
 
     Raises:
-        UserError: the example lacks the encoder's input.
+        UserError: the example lacks the encoder's input, or the encoder is initialised and leaves the hook out.
     """
+    layers: list[int] = []
+    noted = None if hook is None else partial(_noted, hook, layers)
+    output = _encoded(encoder, config, example, memory, train, noted)
+    if hook is not None and encoder.is_initializing() and 0 not in layers:
+        raise UserError(
+            f"a prior enters the BEV features, and {type(encoder).__name__} never calls `fuse` of layer 0, which does "
+            "that: call it (docs/architecture.md, An encoder), or choose priors that enter the queries alone "
+            "(task.model.priors)"
+        )
+    return output
+
+
+def _noted(hook: BevHook, layers: list[int], layer: int, *cells: Any) -> Any:
+    """Call the hook, and note the layer."""
+    layers.append(layer)
+    return hook(layer, *cells)
+
+
+def _encoded(
+    encoder: Any,
+    config: EncoderConfig,
+    example: Example,
+    memory: BevMemory | None,
+    train: bool,
+    hook: BevHook | None,
+) -> EncoderOutput:
     if isinstance(config, CameraEncoderConfig):
         return encoder(example, memory, train=train, fuse=hook)
     if example.bev is None:

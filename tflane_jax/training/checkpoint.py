@@ -153,7 +153,8 @@ class Checkpoints:
             raise UserError(f"{self.folder} holds no checkpoint: the run ended before its first one was written")
         step = steps[-1] if which == "last" else self.best_step() if which == "best" else which
         if step is None:
-            raise UserError(f"no checkpoint in {self.folder} was evaluated, so none is best: ask for `last`")
+            wanted = f"the score {self._best_metric} (training.best_metric)" if self._best_metric else "a score"
+            raise UserError(f"no checkpoint in {self.folder} has {wanted}, so none is best: ask for `last`")
         if step not in steps:
             raise UserError(f"{self.folder} has no checkpoint of step {step}, only {', '.join(map(str, steps))}")
         return step

@@ -30,7 +30,7 @@ from tflane_jax.training.checkpoint import Checkpoints, Manifest
 from tflane_jax.training.fine_tuning import origins, starting_params
 from tflane_jax.training.interrupt import StopRequest
 from tflane_jax.training.provenance import add_provenance
-from tflane_jax.training.records import Record, RecordWriter, Unwritten, Window, read_records, seed_record
+from tflane_jax.training.records import Record, RecordWriter, Unwritten, Window, by_name, read_records, seed_record
 from tflane_jax.training.restarts import adapt
 from tflane_jax.training.run_folder import CurrentForm, Start, check_unchanged, claimed
 from tflane_jax.training.schedule import OptimConfig, make_optimizer, scaled_to_batch
@@ -44,6 +44,11 @@ Evaluate = Callable[[Params], dict[str, float]]
 """Averaged parameters of one seed -> numbers by name."""
 Draw = Callable[[Path, int, Params, list[Record]], None]
 """(run folder, step, averaged parameters of the first seed, all records) -> pictures in the run folder."""
+
+_NO_BEST = (
+    "step {}: the evaluation has no {} (training.best_metric), so no checkpoint is the best; it stays so if the "
+    "validation examples have no such lanes: then choose another score"
+)
 
 
 @dataclass(frozen=True)
@@ -274,8 +279,10 @@ def train(
                 if evaluate is not None and (step % config.eval_every == 0 or is_last):
                     measured = [evaluate(state.ema_params) for state in states]  # several processes predict together
                     evaluations = from_first(lambda measured=measured: measured)
-                    writer.write(seed_record(step, "val", {k: [e[k] for e in evaluations] for k in evaluations[0]}))
-                    metrics = {k: float(np.mean([e[k] for e in evaluations])) for k in evaluations[0]}
+                    writer.write(seed_record(step, "val", scores := by_name(evaluations)))
+                    if not metrics and config.best_metric not in scores and is_first():
+                        _print_notices([_NO_BEST.format(step, config.best_metric)])
+                    metrics = {name: float(np.mean(values)) for name, values in scores.items()}
                     if adaptive is not None:
                         together = of_all_seeds([state.opt_state for state in states])
                         together, memories, cycles = adapt(adaptive, together, memories, evaluations, config.steps)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
@@ -176,6 +176,11 @@ class Window:
     def record(self, step: int) -> Record:
         means = {name: np.divide(values, self.steps).tolist() for name, values in self.sums.items()}
         return seed_record(step, "train", means)
+
+
+def by_name(every: Sequence[Mapping[str, float]]) -> dict[str, list[float]]:
+    """Return the values that all seeds have, a list of one per seed by name."""
+    return {name: [one[name] for one in every] for name in every[0] if all(name in one for one in every)}
 
 
 def seed_record(step: int, split: str, values: dict[str, list[float]]) -> Record:

@@ -106,7 +106,11 @@ def tables(commands) -> None:
         type=int,
         help="cores of each training, on which its numbers depend (default: all, shared between --jobs)",
     )
-    parser.add_argument("--quick", action="store_true", help="a few updates on a few scenes: a smoke test, no result")
+    parser.add_argument(
+        "--quick",
+        action="store_true",
+        help="a few updates on a few scenes: a smoke test of some minutes, mostly compiling; no result",
+    )
     parser.add_argument(
         "--search",
         action="store_true",

@@ -13,20 +13,20 @@ class SourceName:
     """Type of an argument that names a data source; imports the list of sources only when it is needed.
 
     Args:
-        checked: accept only sources whose folder can be checked.
+        checked: list only sources whose folder can be checked; for others, the command says why not.
     """
 
     def __init__(self, *, checked: bool = False):
         self._checked = checked
 
     def names(self) -> list[str]:
-        """Return the accepted names."""
+        """Return the names to list."""
         from tflane_jax.datasets.sources import SOURCES
 
         return [source.name for source in SOURCES if source.check is not None or not self._checked]
 
     def __call__(self, text: str) -> str:
-        if text not in self.names():
+        if text not in SourceName().names():
             raise argparse.ArgumentTypeError(f"{text!r} is none of {', '.join(self.names())}")
         return text
 

@@ -90,6 +90,21 @@ def test_a_drive_from_pixels_to_lanes(drive, tmp_path, capsys):
     assert first["guidance"]
 
 
+def test_both_boards_of_one_id_are_counted_and_recorded(drive, tmp_path, capsys):
+    images, out = tmp_path / "images", tmp_path / "out"
+    shutil.copytree(drive, images)
+    left, right = (seen_from(0.0, {3: pose(*place)}).image[0] for place in ((15.0, 3.0, 2.0), (20.0, -5.0, 2.5)))
+    both = np.concatenate([left[:, :480], right[:, 480:]], 1)
+    cv2.imwrite(str(images / "1.png"), both[..., ::-1])
+    assert main(arguments(drive, out, images=images)) == 0
+    boards = json.loads((out / "frames.json").read_text())["frames"][1]["boards"]
+    assert [(board["id"], board["outcome"], board["camera"]) for board in boards] == [(3, "contradictory", "front")] * 2
+    middles = sorted(np.mean(board["corners"], 0)[0] for board in boards)
+    assert middles[0] < 480 < middles[1]
+    row = [cell.strip() for cell in capsys.readouterr().out.splitlines()[4].split("|")[1:-1]]
+    assert row[3:] == ["1", "1", "1", "2", "0"]
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [

@@ -2,13 +2,15 @@
 
 `run` reads a drive (`datasets.drive_files`) and a store, and writes a picture for each frame and frames.json:
     {"store", "model", "threshold", "frames": [{"timestamp_ns", "picture", "gate", "remembered",
-     "boards": [{"id", "outcome", "score", "size", "position", "distance", "residual", "confidence"}, ...],
+     "boards": [{"id", "outcome", "score", "size", "position", "distance", "camera", "corners", "residual",
+                 "confidence"}, ...],
      "guidance": [{"weight", "points": [[x, y], ...]}, ...],
      "lanes": [{"score", "points": [[x, y, z], ...]}, ...]}, ...],
      "faults": [{"file", "error"}, ...]}
     "outcome" is one of `markers.observe.Outcome`; "residual" and "confidence" exist for boards that give a prior,
-    "lanes" with a model. Coordinates are in the ego frame, metres. `faults` are images that could not be read; their
-    cameras saw nothing in that frame.
+    "lanes" with a model. An id that was read at two places has two entries. Coordinates are in the ego frame, metres;
+    corners of the black square are pixels of the camera's undistorted image. `faults` are images that could not be
+    read; their cameras saw nothing in that frame.
 
 `render` writes such a drive of the built-in world, with its store.
 """
@@ -20,6 +22,7 @@ import datetime
 import sys
 import warnings
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -39,9 +42,10 @@ from tflane_jax.markers.reader import MarkerReader, ReaderConfig
 from tflane_jax.markers.store import MarkerStore, StaleMarkerWarning, UnknownMarkerWarning
 from tflane_jax.markers.store_files import load_store, save_store
 from tflane_jax.plots import format_table
-from tflane_jax.plots.marker_drive import save_drive_frame
+from tflane_jax.plots.marker_drive import board_outline, save_drive_frame
 from tflane_jax.progress import progress_bar
 from tflane_jax.runs import open_run
+from tflane_jax.scene import CameraViews
 from tflane_jax.scene.marker_patterns import MarkerFamily, marker_count
 from tflane_jax.tasks.lane_pictures import lanes_of
 from tflane_jax.tasks.marker_drive import DriveModel, DriveStep, MarkerDrive, as_trained, check_model, check_rate
@@ -109,7 +113,7 @@ def _follow(
 
     Images that cannot be read are added to `faults`.
     """
-    frames, outcomes = [], Counter()
+    frames, outcomes, names = [], Counter(), [camera.name for camera in drive.cameras]
     with warnings.catch_warnings():
         # The table counts them.
         warnings.simplefilter("ignore", UnknownMarkerWarning)
@@ -117,10 +121,10 @@ def _follow(
         for number, frame in enumerate(progress_bar(drive.frames, desc="drive", unit="frame")):
             views = drive.views(frame, faults)
             step = steps.step(views, frame.timestamp_ns, frame.global_from_ego, search_views(views, detector))
-            outcomes.update(step.reading.observed.outcomes.values())
             picture = f"{number:03d}.png"
             record = {"timestamp_ns": frame.timestamp_ns, "picture": picture}
-            frames.append(record | _record(step, options.threshold))
+            frames.append(record | _record(step, views, names, options.threshold))
+            outcomes.update(board["outcome"] for board in frames[-1]["boards"])
             save_drive_frame(
                 options.out / picture,
                 views,
@@ -130,7 +134,7 @@ def _follow(
                 step.guidance,
                 None if step.prediction is None else lanes_of(step.prediction),
                 view=view,
-                names=[camera.name for camera in drive.cameras],
+                names=names,
                 title=f"frame {number}, {'remembered' if step.remembered else 'seen'}, c = {step.guidance.gate:.2f}",
                 threshold=options.threshold,
             )
@@ -176,7 +180,7 @@ def _confidence(step: DriveStep) -> dict[int, float]:
     return {int(markers.marker_id[k]): float(step.confidence[k]) for k in np.flatnonzero(markers.valid)}
 
 
-def _record(step: DriveStep, threshold: float) -> dict[str, Any]:
+def _record(step: DriveStep, views: CameraViews, names: Sequence[str], threshold: float) -> dict[str, Any]:
     """Return a frame as plain values."""
     detected, markers, guidance = step.reading.detected, step.reading.observed.markers, step.guidance
     residual = {int(markers.marker_id[k]): float(markers.residual[k]) for k in np.flatnonzero(markers.valid)}
@@ -193,6 +197,8 @@ def _record(step: DriveStep, threshold: float) -> dict[str, Any]:
                 "size": round(float(detected.size[k]), 4),
                 "position": position.round(3).tolist(),
                 "distance": round(float(np.hypot(*position[:2])), 3),
+                "camera": names[int(detected.camera[k])],
+                "corners": board_outline(views, detected, k).round(1).tolist(),
                 **{name: round(value, 4) for name, value in prior.items()},
             }
         )

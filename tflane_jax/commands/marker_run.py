@@ -24,10 +24,11 @@ import warnings
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
+from tflane_jax.commands.marker_store import day_of
 from tflane_jax.commands.sources import make_folder
 from tflane_jax.datasets.drive_files import Drive, DriveCamera, DriveFrame, load_drive, save_drive, thinned
 from tflane_jax.datasets.marker_cache import search_views
@@ -38,6 +39,7 @@ from tflane_jax.files.atomic import write_bytes, write_json
 from tflane_jax.files.images import opencv
 from tflane_jax.geometry import PerceptionRange, invert_pose
 from tflane_jax.markers.image_search import DetectorConfig
+from tflane_jax.markers.observe import Outcome
 from tflane_jax.markers.reader import MarkerReader, ReaderConfig
 from tflane_jax.markers.store import MarkerStore, StaleMarkerWarning, UnknownMarkerWarning
 from tflane_jax.markers.store_files import load_store, save_store
@@ -76,6 +78,7 @@ def run(options: argparse.Namespace) -> int:
     range_ = PerceptionRange() if model is None else model.source.example.range
     detector = _detector(options, store)
     config = ReaderConfig(detector, range_, today=_day(options), max_age_days=_age(options))
+    doubts = _doubtful_dates(store, _day(options), config.max_age_days)
     steps = MarkerDrive(MarkerReader(store, as_trained(config, model)), model)
     faults: dict[str, str] = {}
     if model is not None:
@@ -88,12 +91,14 @@ def run(options: argparse.Namespace) -> int:
     head = {"store": str(options.store), "model": None if options.model is None else str(options.model)}
     told = [{"file": file, "error": error} for file, error in faults.items()]
     write_json(options.out / "frames.json", head | {"threshold": options.threshold, "frames": frames, "faults": told})
-    boards = {f"boards {name}": outcomes[name] for name in ("used", "unknown", "stale", "contradictory", "dropped")}
+    boards = {f"boards {name}": outcomes[name] for name in get_args(Outcome)}
     guided = sum(bool(frame["guidance"]) for frame in frames)
     remembered = sum(frame["remembered"] for frame in frames)
     rows = [{"frames": len(frames), "with lanes": guided, "from memory": remembered} | boards]
     print(format_table(rows, title=f"{options.poses}: markers of {options.store}"))
     print(f"\nwritten to {options.out}")
+    for text in doubts:
+        print(f"tflane: warning: {text}", file=sys.stderr)
     for error in faults.values():
         print(f"tflane: {error}", file=sys.stderr)
     if faults:
@@ -161,12 +166,25 @@ def _detector(options: argparse.Namespace, store: MarkerStore) -> DetectorConfig
 
 
 def _day(options: argparse.Namespace) -> datetime.date:
-    if options.today is None:
-        return datetime.date.today()
-    try:
-        return datetime.date.fromisoformat(options.today)
-    except ValueError:
-        raise UserError(f"--today {options.today} is no day: write it like 2025-07-11") from None
+    return day_of(options.today, "--today") or datetime.date.today()
+
+
+def _doubtful_dates(store: MarkerStore, today: datetime.date, max_age_days: int | None) -> list[str]:
+    """Return a sentence for entries whose age is unknown where it counts, and one for surveys in the future."""
+    told, entries = [], store.markers.values()
+    undated = [entry.marker_id for entry in entries if entry.surveyed is None]
+    if undated and max_age_days is not None:
+        told.append(
+            f"{store.source}: {len(undated)} of {len(entries)} markers have no day of survey (first: {undated[0]}), so "
+            'they count as stale: write "surveyed" into the store, or leave out --max-age-days'
+        )
+    future = [entry for entry in entries if entry.surveyed is not None and entry.surveyed > today]
+    if future:
+        told.append(
+            f"{store.source}: {len(future)} of {len(entries)} markers were surveyed after {today} (first: "
+            f'{future[0].marker_id} on {future[0].surveyed}): correct "surveyed" in the store, or --today'
+        )
+    return told
 
 
 def _age(options: argparse.Namespace) -> int | None:
@@ -176,8 +194,10 @@ def _age(options: argparse.Namespace) -> int | None:
 
 
 def _confidence(step: DriveStep) -> dict[int, float]:
-    markers = step.reading.observed.markers
-    return {int(markers.marker_id[k]): float(step.confidence[k]) for k in np.flatnonzero(markers.valid)}
+    """Return the confidence of each id that gives lanes."""
+    markers, outcomes = step.reading.observed.markers, step.reading.observed.outcomes
+    rows = {int(markers.marker_id[k]): float(step.confidence[k]) for k in np.flatnonzero(markers.valid)}
+    return {number: trust for number, trust in rows.items() if outcomes[number] == "used"}
 
 
 def _record(step: DriveStep, views: CameraViews, names: Sequence[str], threshold: float) -> dict[str, Any]:
@@ -226,6 +246,7 @@ def render(options: argparse.Namespace) -> int:
     """Write a drive of the built-in world: images, poses.json and store.json."""
     if options.frames < 1 or not options.scale > 0.0:
         raise UserError("--frames must be at least 1 and --scale positive")
+    surveyed = day_of(options.surveyed, "--surveyed")
     if options.log < 0:
         raise UserError(f"--log is the number of a scene, 0 or more, not {options.log}")
     ring = _RINGS[options.ring]
@@ -235,7 +256,7 @@ def render(options: argparse.Namespace) -> int:
     # Two seconds of history come before the first frame.
     world = WorldConfig(duration_s=1.6 + 0.5 * options.frames, keyframes=options.frames, markers=boards)
     log = simulate(options.log, world)
-    store = store_of_log(log, radius=50.0, bike_lanes=True)
+    store = store_of_log(log, radius=50.0, bike_lanes=True, surveyed=surveyed)
     if not store.markers:
         raise UserError(f"{log.name} has no junction, split or merge, and so no marker: take another --log")
     mounts = ring[: options.cameras]

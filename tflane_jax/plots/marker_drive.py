@@ -43,6 +43,7 @@ OUTCOMES: dict[Outcome, str] = {
     "stale": "#ff9d3c",
     "contradictory": "#ff3b30",
     "dropped": "#c8ccd4",
+    "no lanes": "#5ac8fa",
 }
 _DOUBTED, _TRUSTED = np.array([0.45, 0.30, 0.36]), np.array([1.0, 0.93, 0.35])
 
@@ -64,8 +65,8 @@ def save_drive_frame(
     """Write one frame and return the path.
 
     A board's colour is its outcome (green used, yellow unknown, orange out of date, red read at two places, grey one
-    too many), its label id, outcome and confidence. Lanes of markers are yellow, the darker the less they are trusted;
-    predicted lanes are blue.
+    too many, light blue without lanes in the store), its label id, outcome and confidence. Lanes of markers are yellow,
+    the darker the less they are trusted; predicted lanes are blue.
 
     Args:
         path: .png, .pdf or .svg.

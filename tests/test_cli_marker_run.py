@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from tests.markers.test_detection import AHEAD, pose
-from tests.markers.test_reader import BOARDS, LANES, SECOND, ego, seen_from
+from tests.markers.test_reader import BOARDS, LANES, SECOND, STORE, ego, seen_from
 from tests.tasks.test_marker_drive import Remembering
 from tflane_jax.cli import main
 from tflane_jax.commands import marker_run
@@ -86,8 +86,23 @@ def test_a_drive_from_pixels_to_lanes(drive, tmp_path, capsys):
     assert {board["id"]: board["outcome"] for board in last["boards"]} == {8: "stale", 40: "unknown"}
     assert all("confidence" not in board for board in last["boards"])
     row = [cell.strip() for cell in capsys.readouterr().out.splitlines()[4].split("|")[1:-1]]
-    assert row == ["4", "4", "2", "2", "1", "1", "0", "0"]
+    assert row == ["4", "4", "2", "2", "1", "1", "0", "0", "0"]
     assert first["guidance"]
+
+
+def test_both_boards_of_one_id_are_counted_and_recorded(drive, tmp_path, capsys):
+    images, out = tmp_path / "images", tmp_path / "out"
+    shutil.copytree(drive, images)
+    left, right = (seen_from(0.0, {3: pose(*place)}).image[0] for place in ((15.0, 3.0, 2.0), (20.0, -5.0, 2.5)))
+    both = np.concatenate([left[:, :480], right[:, 480:]], 1)
+    cv2.imwrite(str(images / "1.png"), both[..., ::-1])
+    assert main(arguments(drive, out, images=images)) == 0
+    boards = json.loads((out / "frames.json").read_text())["frames"][1]["boards"]
+    assert [(board["id"], board["outcome"], board["camera"]) for board in boards] == [(3, "contradictory", "front")] * 2
+    middles = sorted(np.mean(board["corners"], 0)[0] for board in boards)
+    assert middles[0] < 480 < middles[1]
+    row = [cell.strip() for cell in capsys.readouterr().out.splitlines()[4].split("|")[1:-1]]
+    assert row[3:] == ["1", "1", "1", "2", "0", "0"]
 
 
 @pytest.mark.parametrize(
@@ -109,6 +124,44 @@ def test_errors_are_one_message(drive, tmp_path, capsys, change, words):
     assert words in error
     assert "Traceback" not in error
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("surveyed", "words"),
+    [
+        (None, 'store.json: 1 of 2 markers have no day of survey (first: 3), so they count as stale: write "surveyed"'),
+        ("2026-02-02", "store.json: 1 of 2 markers were surveyed after 2026-02-01 (first: 3 on 2026-02-02): correct"),
+    ],
+)
+def test_dates_that_make_no_sense_are_told(drive, tmp_path, capsys, surveyed, words):
+    record = json.loads((drive / "store.json").read_text())
+    record["markers"][0]["surveyed"] = surveyed
+    (tmp_path / "store.json").write_text(json.dumps(record))
+    assert main(arguments(drive, tmp_path / "out", store=tmp_path / "store.json")) == 0
+    assert words in capsys.readouterr().err
+
+
+def test_a_board_without_lanes_is_not_used(drive, tmp_path, capsys):
+    record = json.loads((drive / "store.json").read_text())
+    record["markers"][0] |= {"lanes": [], "successors": []}
+    (tmp_path / "store.json").write_text(json.dumps(record))
+    out = tmp_path / "out"
+    assert main(arguments(drive, out, store=tmp_path / "store.json")) == 0
+    (board,) = json.loads((out / "frames.json").read_text())["frames"][0]["boards"]
+    assert board["outcome"] == "no lanes"
+    assert "confidence" not in board
+    row = [cell.strip() for cell in capsys.readouterr().out.splitlines()[4].split("|")[1:-1]]
+    assert row[-1] == "2"
+    assert row[3] == "0"
+
+
+def test_the_rendered_store_has_the_day_of_its_survey(tmp_path, monkeypatch):
+    monkeypatch.setattr(marker_run, "render_cameras", lambda *_: pytest.fail("drawn"))
+    written = []
+    monkeypatch.setattr(marker_run, "store_of_log", lambda log, **options: written.append(options) or STORE)
+    with pytest.raises(pytest.fail.Exception, match="drawn"):
+        main(["markers", "render", "--log", "200000005", "--surveyed", "2026-01-15", "--out", str(tmp_path / "town")])
+    assert written[0]["surveyed"] == datetime.date(2026, 1, 15)
 
 
 def test_any_number_of_days_is_an_age():
@@ -185,6 +238,7 @@ def test_the_rate_of_frames_counts_for_models_with_memory_alone(drive, tmp_path,
         (["--cameras", "-1"], "--cameras is 1 to 7"),
         (["--cameras", "7", "--ring", "nuscenes"], "--cameras is 1 to 6, the cameras of --ring nuscenes"),
         (["--frames", "0"], "--frames"),
+        (["--surveyed", "soon"], "--surveyed soon is no day"),
     ],
 )
 def test_render_refuses_what_it_cannot_draw(tmp_path, capsys, change, words):

@@ -7,6 +7,7 @@ import pytest
 
 from tests.markers.test_detection import AHEAD, photo, pose
 from tflane_jax.cli import main
+from tflane_jax.commands.markers import _label_place
 
 cv2 = pytest.importorskip("cv2")
 
@@ -40,6 +41,36 @@ def test_detect_writes_poses_and_pictures(photos, tmp_path, capsys):
     changed = (picture != plain).any(-1)
     assert 100 < changed.sum() < 0.2 * changed.size
     assert (cv2.imread(str(out / second["picture"])) == cv2.imread(str(photos / "b.png"))).all()
+
+
+def two_boards(path, far=(15.0, 2.0, 2.0)):
+    """Write a photo with two boards of id 42, the second one in the columns of its own."""
+    near, second = (photo(AHEAD, {42: pose(*place)}) for place in ((9.0, -2.0, 2.0), far))
+    columns = slice(200, 480)
+    near[:, columns] = second[:, columns]
+    cv2.imwrite(str(path), near[..., ::-1])
+
+
+def test_two_boards_with_one_id_are_both_reported(tmp_path, capsys):
+    two_boards(tmp_path / "twice.png")
+    out = tmp_path / "out"
+    assert main(["markers", "detect", str(tmp_path / "twice.png"), *INTRINSICS, "--out", str(out)]) == 0
+    found = json.loads((out / "detections.json").read_text())["photos"][0]["markers"]
+    assert [(marker["id"], marker["contradictory"]) for marker in found] == [(42, True), (42, True)]
+    np.testing.assert_allclose(sorted(marker["position"][0] for marker in found), [9.0, 15.0], atol=0.1)
+    assert all(np.shape(marker["corners"]) == (4, 2) for marker in found)
+    said = capsys.readouterr()
+    assert said.out.count("contradictory") == 2
+    assert "twice.png: marker 42 is at several places, x and y (9.0, -2.0) and (15.0, 2.0) m" in said.err
+
+
+@pytest.mark.parametrize("middle", [(480, 260), (5, 5), (955, 5), (5, 535), (955, 535)])
+def test_the_label_of_a_board_lies_in_the_picture(middle):
+    outline = np.add(middle, [(-20, -20), (20, -20), (20, 20), (-20, 20)])
+    left, bottom = _label_place(outline, (130, 12), (960, 540), 4)
+    assert 0 <= left <= 960 - 130
+    assert 12 <= bottom <= 540
+    assert bottom - 12 >= outline[:, 1].max() or bottom <= outline[:, 1].min()
 
 
 def test_distance_is_proportional_to_marker_size(photos, tmp_path):

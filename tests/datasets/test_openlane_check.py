@@ -4,7 +4,6 @@ import json
 import pickle
 import re
 import shutil
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,9 +11,7 @@ import pytest
 from tests.datasets.openlane_scenes import FRAMES, DriveConfig, DriveDataset
 from tflane_jax.cli import main
 from tflane_jax.datasets.openlane_check import check_openlane_v2
-from tflane_jax.datasets.openlane_check_cameras import CameraChecks, image_size
 from tflane_jax.datasets.openlane_export import export_openlane_v2
-from tflane_jax.datasets.openlane_frames import FrameCamera
 from tflane_jax.errors import UserError
 
 cv2 = pytest.importorskip("cv2")
@@ -60,6 +57,7 @@ def test_a_whole_folder_is_counted(whole):
             "lane segments": 3 * FRAMES,
             "elements": 2 * FRAMES,
             "areas": FRAMES,
+            "SD maps": 0,
             "faults": 0,
         }
     ]
@@ -144,73 +142,6 @@ def test_missing_and_damaged_files_are_named(folder):
     assert len(found.faults) == 5
 
 
-def swap(content):
-    left, right = (content["sensor"][f"CAM_FRONT_{side}"] for side in ("LEFT", "RIGHT"))
-    left["extrinsic"], right["extrinsic"] = right["extrinsic"], left["extrinsic"]
-
-
-def invert(content):
-    back = content["sensor"]["CAM_BACK_LEFT"]["extrinsic"]
-    back["rotation"] = [list(row) for row in zip(*back["rotation"], strict=True)]
-
-
-def scale(content):
-    K = content["sensor"]["CAM_BACK"]["intrinsic"]["K"]
-    K[:2] = [[2.0 * value for value in row] for row in K[:2]]
-
-
-def millimetres(content):
-    back = content["sensor"]["CAM_BACK"]["extrinsic"]
-    back["translation"] = [1000.0 * value for value in back["translation"]]
-
-
-def scaled(factor):
-    def function(content):
-        K = content["sensor"]["CAM_FRONT_LEFT"]["intrinsic"]["K"]
-        K[:2] = [[factor * value for value in row] for row in K[:2]]
-
-    return function
-
-
-@pytest.mark.parametrize(
-    ("function", "said"),
-    [
-        (millimetres, r"CAM_BACK is 2193 m from the vehicle's origin: is its translation in metres"),
-        (scaled(0.75), r"CAM_FRONT_LEFT has a focal length of 29 pixels in images of 48 x 32, expected about 38"),
-        (
-            swap,
-            r"CAM_FRONT_RIGHT looks to 5\d degrees .*, expected about -5\d, where CAM_FRONT_LEFT should look: .*swap",
-        ),
-        (swap, "CAM_FRONT_LEFT looks to -5. degrees .*, where CAM_FRONT_RIGHT should look"),
-        (invert, "CAM_BACK_LEFT looks to .* from the ego frame to the camera"),
-        (scale, r"CAM_BACK has its principal point at \(48, 32\) .* in images of 48 x 32: .*another size"),
-    ],
-)
-def test_a_calibration_that_cannot_be_is_named(folder, function, said):
-    for suffix in ("", "-ls"):
-        change(frame(folder, suffix=suffix), function)
-    faults = check_openlane_v2(folder, progress=False).faults
-    assert any(re.search(said, fault) for fault in faults), faults
-    assert len(faults) == (2 if function is swap else 1)
-
-
-@pytest.mark.parametrize("name", ["CAM_BACK", "ring_front_center", "my_camera"])
-@pytest.mark.parametrize("factor", [0.75, 0.85, 0.95, 1.0, 1.05, 1.15, 1.25])
-def test_a_focal_length_is_compared_with_that_of_the_dataset(tmp_path, name, factor):
-    """Images of a tenth of the native size; all intrinsics are scaled, as in images of another size."""
-    focal, width, height = (80.9, 160, 90) if name != "ring_front_center" else (177.6, 155, 205)
-    assert cv2.imwrite(str(tmp_path / "image.png"), np.zeros((height, width, 3), np.uint8))
-    pose = np.eye(4)
-    pose[:3, :3] = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]) * (
-        [[-1.0], [-1.0], [1.0]] if name == "CAM_BACK" else 1.0
-    )
-    intrinsics = np.array([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
-    intrinsics[:2] *= factor
-    camera = FrameCamera(name, tmp_path / "image.png", intrinsics, pose)
-    _, faults = CameraChecks().check(SimpleNamespace(path=tmp_path, cameras=(camera,)))
-    assert len(faults) == (abs(factor - 1.0) > 0.1 and name != "my_camera"), faults
-
-
 def test_a_camera_that_frames_lack_is_one_fault(folder):
     for number in (0, 2):
         change(frame(folder, number), lambda content: content["sensor"].pop("CAM_BACK"))
@@ -219,40 +150,9 @@ def test_a_camera_that_frames_lack_is_one_fault(folder):
     assert not check_openlane_v2(folder, cameras="some", progress=False).faults
 
 
-def images_of(folder, camera="CAM_FRONT_LEFT"):
-    return sorted((folder / "train" / "01000" / "image" / camera).iterdir())
-
-
-def test_an_image_of_another_size_is_named(folder):
-    path = images_of(folder)[1]
-    shutil.copy(images_of(folder, "CAM_BACK_RIGHT")[1], path)
-    (fault,) = check_openlane_v2(folder, progress=False).faults
-    assert fault == f"{path} is 48 x 16 pixels, the first image of CAM_FRONT_LEFT is 48 x 32"
-
-
-@pytest.mark.parametrize("damage", [b"\xff\xc1", bytes(5000)], ids=["marker", "hole"])
-def test_damage_within_an_image_is_found_where_it_is_read_as_a_whole(folder, damage):
-    noise = np.random.default_rng(0).integers(0, 256, (200, 300, 3), dtype=np.uint8)
-    for path in images_of(folder):
-        assert cv2.imwrite(str(path), noise)
-    path = images_of(folder)[2]
-    assert not any("damaged" in fault for fault in check_openlane_v2(folder, images="whole", progress=False).faults)
-    content = bytearray(path.read_bytes())
-    content[10_000 : 10_000 + len(damage)] = damage
-    path.write_bytes(content)
-    assert not any("damaged" in fault for fault in check_openlane_v2(folder, progress=False).faults)
-    found = [fault for fault in check_openlane_v2(folder, images="whole", progress=False).faults if "damaged" in fault]
-    (fault,) = found
-    assert re.fullmatch(rf"{re.escape(str(path))} is damaged (9999|10000) bytes after its start", fault)
-
-
-def test_the_size_of_an_image_is_in_its_header(tmp_path):
-    for name in ("a.jpg", "a.png"):
-        cv2.imwrite(str(tmp_path / name), np.zeros((7, 300, 3), np.uint8))
-        assert image_size(tmp_path / name) == (300, 7)
-        (tmp_path / name).write_bytes((tmp_path / name).read_bytes()[:20])
-        assert image_size(tmp_path / name) is None
-    assert image_size(tmp_path / "none.jpg") is None
+def swap(content):
+    left, right = (content["sensor"][f"CAM_FRONT_{side}"] for side in ("LEFT", "RIGHT"))
+    left["extrinsic"], right["extrinsic"] = right["extrinsic"], left["extrinsic"]
 
 
 def test_both_subsets_in_one_folder(folder, tmp_path):
@@ -267,23 +167,61 @@ def test_both_subsets_in_one_folder(folder, tmp_path):
     assert [row["faults"] for row in check_openlane_v2(folder, progress=False).rows] == [0, 2]
 
 
+STRAYS = (
+    "README", "sample/", "trian/", "train/readme", "train/empty/", "train/01000/notes.txt",
+    "train/01000/info/.DS_Store", "train/01000/info/15 (1).json", "train/01000/info/notes.json",
+    "train/01000/info/7.json/", "train/01000/image/CAM_ROOF/", "train/01000/image/CAM_BACK/Thumbs.db",
+)  # fmt: skip
+
+
+def stray(folder, names):
+    for name in names:
+        path = folder / name
+        if name.endswith("/"):
+            path.mkdir()
+        else:
+            path.write_text("x")
+
+
 def test_stray_files_are_named_and_skipped(folder, capsys):
-    segment = folder / "train" / "01000"
-    strays = [segment / "info" / name for name in (".DS_Store", "15 (1).json", "notes.json")] + [
-        folder / "train/readme"
-    ]
-    for path in strays:
-        path.write_text("x")
-    (folder / "train" / "empty").mkdir()
+    stray(folder, STRAYS)
     found = check_openlane_v2(folder, progress=False)
     assert found.faults == []
-    assert [text.partition(" is no ")[0] for text in found.skipped] == sorted(
-        map(str, [*strays, folder / "train/empty"])
+    assert [re.split(" is (?:no|neither) ", text)[0] for text in found.skipped] == sorted(
+        str(folder / name) for name in STRAYS
     )
     assert main(["data", "check", "--format", "openlane-v2", str(folder)]) == 0
     said = capsys.readouterr().out
-    assert "5 skipped:" in said
+    assert f"{len(STRAYS)} skipped:" in said
     assert "readme is no segment" in said
+
+
+def test_long_lists_are_cut_unless_all_is_asked_for(folder, capsys):
+    stray(folder, [f"train/{number:03d}.txt" for number in range(60)])
+    for number in range(70):
+        (folder / f"{number:03d}.pkl").write_bytes(b"")
+    command = ["data", "check", "--format", "openlane-v2", str(folder)]
+    assert main(command) == 2
+    said = capsys.readouterr().out
+    assert "... and 20 more: --all lists them" in said
+    assert "... and 10 more: --all lists them" in said
+    assert "059.txt" not in said
+    assert main([*command, "--all"]) == 2
+    said = capsys.readouterr().out
+    assert said.count("  - ") == 130
+    assert "more:" not in said
+
+
+def test_sd_maps_are_counted_and_checked(tmp_path):
+    folder = export_openlane_v2({"train": DriveDataset(DriveConfig(scenes=3))}, tmp_path / "made", progress=False)
+    maps = [folder / "train" / segment / "sdmap.json" for segment in ("01000", "01001", "01002")]
+    maps[0].write_text('[{"category": "road", "points": [[0, 0], [1, 1]]}]')
+    maps[1].write_text('{"a"')
+    found = check_openlane_v2(folder, progress=False)
+    assert found.rows[0]["SD maps"] == 1
+    damaged, missing = found.faults
+    assert f"{maps[1]} is no JSON file" in damaged
+    assert "1 of 3 segments have no sdmap.json (first train/01002)" in missing
 
 
 def collection(folder):

@@ -42,3 +42,11 @@ def test_frames_are_named_after_their_times(tmp_path, name):
     (tmp_path / "train" / "00000" / "info" / f"{name}.json").touch()
     with pytest.raises(UserError, match=rf"frame train/00000/{name} has no whole number as its timestamp"):
         list_frames(tmp_path, "train", "A")
+
+
+def test_the_folders_of_both_subsets_give_the_frames_of_one(tmp_path):
+    listed(tmp_path, "train", ("1", "2", "3"), None)
+    for segment, camera in (("1", "ring_front_center"), ("2", "CAM_FRONT")):
+        (tmp_path / "train" / segment / "info" / "1.json").write_text(json.dumps({"sensor": {camera: {}}}))
+    for subset, segments in (("A", ["1", "3"]), ("B", ["2", "3"])):  # 3 is damaged: reading it names the fault
+        assert [key.segment for key in list_frames(tmp_path, "train", subset, "folders")] == segments

@@ -6,8 +6,16 @@ import numpy as np
 import pytest
 
 from tflane_jax.datasets.base import TruncationWarning
-from tflane_jax.datasets.openlane_sd_map import SdLines, frame_sd_map, read_sd_lines, sd_records
+from tflane_jax.datasets.openlane_sd_map import (
+    SdLines,
+    SegmentSdMaps,
+    frame_sd_map,
+    read_sd_lines,
+    sd_map_path,
+    sd_records,
+)
 from tflane_jax.errors import UserError
+from tflane_jax.files.openlane import FrameKey
 from tflane_jax.geometry import PerceptionRange, yaw_pose
 from tflane_jax.scene import SdCategory
 from tflane_jax.world.roads.sd_map import SdMapConfig
@@ -69,3 +77,12 @@ def test_lines_of_one_point_are_left_out(tmp_path):
     path.write_text('[{"category": "side_walk", "points": [[1, 2]]}, {"category": "road", "points": []}]')
     assert read_sd_lines(path).lines == ()
     assert not frame_sd_map(read_sd_lines(path), np.eye(4), CONFIG).valid.any()
+
+
+def test_missing_files_are_told_before_a_frame_is_read(tmp_path):
+    keys = [FrameKey("train", segment, "1") for segment in ("1", "2")]
+    sd_map_path(tmp_path, keys[0]).parent.mkdir(parents=True)
+    sd_map_path(tmp_path, keys[0]).write_text("{")  # damaged: not read yet
+    SegmentSdMaps(tmp_path, keys[:1])
+    with pytest.raises(UserError, match=r"1 of 2 SD maps are missing \(.*2/sdmap\.json, \.\.\.\): unpack the SD maps"):
+        SegmentSdMaps(tmp_path, keys)

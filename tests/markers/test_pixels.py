@@ -9,6 +9,7 @@ from tests.markers.test_simulation import markers_at, standing
 from tflane_jax.datasets.base import ExampleConfig
 from tflane_jax.datasets.marker_observations import marker_observations, store_of_log
 from tflane_jax.errors import UserError
+from tflane_jax.limits import SettingError
 from tflane_jax.markers.image_search import DetectorConfig, find_markers
 from tflane_jax.markers.observe import observe
 from tflane_jax.markers.pixels import PixelConfig, detect_in_world
@@ -31,6 +32,8 @@ def scene():
 
 def test_the_short_form_names_the_default_settings():
     assert ExampleConfig(markers="pixels") == ExampleConfig(markers=MarkerConfig(pixels=PixelConfig()))  # pyright: ignore
+    with pytest.raises(SettingError, match="markers is 'pixel': it must be a MarkerConfig, 'pixels' or None"):
+        ExampleConfig(markers="pixel")  # pyright: ignore
     assert ExampleConfig().markers is None
     native = PixelConfig().native(CAMERAS)
     assert (native.scale, native.cameras, native.markers) == (1.0, CAMERAS.cameras, True)

@@ -88,6 +88,7 @@ def saved(tmp_path):
             "marker 1: lanes holds a value missing (null)",
         ),
         (lambda r: r["markers"][1].update(lanes=[[[0, 0, 0]]]), "marker 1: lanes have 1 points"),
+        (lambda r: r["markers"][1].update(lanes=[[[2, 0, 1]] * 3]), "marker 1: lanes[0] has no length"),
         (lambda r: r["markers"][1].update(lanes=[[[0, 0], [1, 1]]]), "marker 1: lanes has shape (1, 2, 2)"),
         (lambda r: r["markers"][1]["lanes"][0].pop(), "marker 1: lanes is of type list"),
         (lambda r: r["markers"][1]["lanes"][0][3].__setitem__(1, float("nan")), "lanes holds nan at [0, 3, 1]"),

@@ -74,3 +74,25 @@ def test_the_label_of_a_board_lies_on_the_side_away_from_lanes_and_can_be_read_o
 def test_boards_out_of_the_panel_have_no_label(tmp_path, monkeypatch):
     panel = panel_from_above((70.0, 0.0), NO_LANES, tmp_path, monkeypatch)
     assert [text.get_text() for text in panel.texts if "98" in text.get_text()] == []
+
+
+@pytest.mark.parametrize("side", [(-13.9, 8.4), (13.9, 8.4), (-13.9, -10.6), (13.9, -10.6), (0.0, 0.0)])
+def test_the_label_of_a_board_lies_in_the_image(side, tmp_path, monkeypatch):
+    """Boards in the corners of an image of 64 x 48 pixels, 25 m ahead."""
+    found = DetectedMarkers.empty(1)
+    found.valid[:], found.marker_id[:], found.size[:] = True, 98, 1.0
+    found.pose[0, :3, :3] = np.array([[0, 0, -1], [1, 0, 0], [0, 1, 0]])
+    found.pose[0, :3, 3] = 25.0, -side[0], 1.5 - side[1]
+    front = np.array([[0, -1, 0, 0], [0, 0, -1, 1.5], [1, 0, 0, 0], [0, 0, 0, 1]], np.float32)[None]
+    size, intrinsics = np.array([[64, 48]]), np.array([[[50.0, 0, 32], [0, 50, 24], [0, 0, 1]]])
+    views = CameraViews(np.zeros((1, 48, 64, 3), np.uint8), size, intrinsics, front, np.ones(1, bool))
+    drawn = []
+    monkeypatch.setattr(marker_drive, "save_figure", lambda figure, path: drawn.append(figure))
+    outcome = {98: "contradictory"}
+    marker_drive.save_drive_frame(tmp_path / "x.png", views, found, outcome, {}, NO_LANES, view=PerceptionRange())
+    drawn[0].draw_without_rendering()
+    panel = drawn[0].axes[0]
+    (label,) = (text for text in panel.texts if text.get_text() == "98: contradictory")
+    box, frame = label.get_window_extent(), panel.get_window_extent()
+    assert frame.x0 - 1 <= box.x0 <= box.x1 <= frame.x1 + 1
+    assert frame.y0 - 1 <= box.y0 <= box.y1 <= frame.y1 + 1

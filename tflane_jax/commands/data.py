@@ -26,7 +26,7 @@ from tflane_jax.tasks import spread
 from tflane_jax.tasks.lane_pictures import titles
 from tflane_jax.tasks.lane_shape import LaneShapeTask
 
-_PRINTED_FAULTS = 50
+_PRINTED = 50  # faults, and entries skipped
 _FORMAT = "argoverse2"  # of `data check`, by default
 
 
@@ -109,19 +109,18 @@ def check(options: argparse.Namespace) -> int:
         others = ", ".join(one.name for one in sources.SOURCES if one.check is not None and one.name != _FORMAT)
         raise UserError(f"{error}; name other data with --format ({others})") from None
     print(format_table(found.rows, title=f"{options.root}: {found.format}"))
-    if found.faults:
-        print(
-            f"\n{counted(len(found.faults), 'fault')}:",
-            *(f"  - {fault}" for fault in found.faults[:_PRINTED_FAULTS]),
-            sep="\n",
-        )
-    if len(found.faults) > _PRINTED_FAULTS:
-        print(f"  ... and {len(found.faults) - _PRINTED_FAULTS} more")
-    if found.skipped:
-        print(
-            f"\n{len(found.skipped)} skipped:", *(f"  - {text}" for text in found.skipped[:_PRINTED_FAULTS]), sep="\n"
-        )
+    _print_list(counted(len(found.faults), "fault"), found.faults, every=options.all)
+    _print_list(f"{len(found.skipped)} skipped", found.skipped, every=options.all)
     return 2 if found.faults else 0
+
+
+def _print_list(title: str, texts: Sequence[str], *, every: bool) -> None:
+    if not texts:
+        return
+    shown = texts if every else texts[:_PRINTED]
+    print(f"\n{title}:", *(f"  - {text}" for text in shown), sep="\n")
+    if len(shown) < len(texts):
+        print(f"  ... and {len(texts) - len(shown)} more: --all lists them")
 
 
 def overlap_of_splits(options: argparse.Namespace) -> int:

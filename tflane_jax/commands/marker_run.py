@@ -2,13 +2,15 @@
 
 `run` reads a drive (`datasets.drive_files`) and a store, and writes a picture for each frame and frames.json:
     {"store", "model", "threshold", "frames": [{"timestamp_ns", "picture", "gate", "remembered",
-     "boards": [{"id", "outcome", "score", "size", "position", "distance", "residual", "confidence"}, ...],
+     "boards": [{"id", "outcome", "score", "size", "position", "distance", "camera", "corners", "residual",
+                 "confidence"}, ...],
      "guidance": [{"weight", "points": [[x, y], ...]}, ...],
      "lanes": [{"score", "points": [[x, y, z], ...]}, ...]}, ...],
      "faults": [{"file", "error"}, ...]}
     "outcome" is one of `markers.observe.Outcome`; "residual" and "confidence" exist for boards that give a prior,
-    "lanes" with a model. Coordinates are in the ego frame, metres. `faults` are images that could not be read; their
-    cameras saw nothing in that frame.
+    "lanes" with a model. An id that was read at two places has two entries. Coordinates are in the ego frame, metres;
+    corners of the black square are pixels of the camera's undistorted image. `faults` are images that could not be
+    read; their cameras saw nothing in that frame.
 
 `render` writes such a drive of the built-in world, with its store.
 """
@@ -20,11 +22,13 @@ import datetime
 import sys
 import warnings
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
+from tflane_jax.commands.marker_store import day_of
 from tflane_jax.commands.sources import make_folder
 from tflane_jax.datasets.drive_files import Drive, DriveCamera, DriveFrame, load_drive, save_drive, thinned
 from tflane_jax.datasets.marker_cache import search_views
@@ -35,13 +39,15 @@ from tflane_jax.files.atomic import write_bytes, write_json
 from tflane_jax.files.images import opencv
 from tflane_jax.geometry import PerceptionRange, invert_pose
 from tflane_jax.markers.image_search import DetectorConfig
+from tflane_jax.markers.observe import Outcome
 from tflane_jax.markers.reader import MarkerReader, ReaderConfig
 from tflane_jax.markers.store import MarkerStore, StaleMarkerWarning, UnknownMarkerWarning
 from tflane_jax.markers.store_files import load_store, save_store
 from tflane_jax.plots import format_table
-from tflane_jax.plots.marker_drive import save_drive_frame
+from tflane_jax.plots.marker_drive import board_outline, save_drive_frame
 from tflane_jax.progress import progress_bar
 from tflane_jax.runs import open_run
+from tflane_jax.scene import CameraViews
 from tflane_jax.scene.marker_patterns import MarkerFamily, marker_count
 from tflane_jax.tasks.lane_pictures import lanes_of
 from tflane_jax.tasks.marker_drive import DriveModel, DriveStep, MarkerDrive, as_trained, check_model, check_rate
@@ -72,6 +78,7 @@ def run(options: argparse.Namespace) -> int:
     range_ = PerceptionRange() if model is None else model.source.example.range
     detector = _detector(options, store)
     config = ReaderConfig(detector, range_, today=_day(options), max_age_days=_age(options))
+    doubts = _doubtful_dates(store, _day(options), config.max_age_days)
     steps = MarkerDrive(MarkerReader(store, as_trained(config, model)), model)
     faults: dict[str, str] = {}
     if model is not None:
@@ -84,12 +91,14 @@ def run(options: argparse.Namespace) -> int:
     head = {"store": str(options.store), "model": None if options.model is None else str(options.model)}
     told = [{"file": file, "error": error} for file, error in faults.items()]
     write_json(options.out / "frames.json", head | {"threshold": options.threshold, "frames": frames, "faults": told})
-    boards = {f"boards {name}": outcomes[name] for name in ("used", "unknown", "stale", "contradictory", "dropped")}
+    boards = {f"boards {name}": outcomes[name] for name in get_args(Outcome)}
     guided = sum(bool(frame["guidance"]) for frame in frames)
     remembered = sum(frame["remembered"] for frame in frames)
     rows = [{"frames": len(frames), "with lanes": guided, "from memory": remembered} | boards]
     print(format_table(rows, title=f"{options.poses}: markers of {options.store}"))
     print(f"\nwritten to {options.out}")
+    for text in doubts:
+        print(f"tflane: warning: {text}", file=sys.stderr)
     for error in faults.values():
         print(f"tflane: {error}", file=sys.stderr)
     if faults:
@@ -109,7 +118,7 @@ def _follow(
 
     Images that cannot be read are added to `faults`.
     """
-    frames, outcomes = [], Counter()
+    frames, outcomes, names = [], Counter(), [camera.name for camera in drive.cameras]
     with warnings.catch_warnings():
         # The table counts them.
         warnings.simplefilter("ignore", UnknownMarkerWarning)
@@ -117,10 +126,10 @@ def _follow(
         for number, frame in enumerate(progress_bar(drive.frames, desc="drive", unit="frame")):
             views = drive.views(frame, faults)
             step = steps.step(views, frame.timestamp_ns, frame.global_from_ego, search_views(views, detector))
-            outcomes.update(step.reading.observed.outcomes.values())
             picture = f"{number:03d}.png"
             record = {"timestamp_ns": frame.timestamp_ns, "picture": picture}
-            frames.append(record | _record(step, options.threshold))
+            frames.append(record | _record(step, views, names, options.threshold))
+            outcomes.update(board["outcome"] for board in frames[-1]["boards"])
             save_drive_frame(
                 options.out / picture,
                 views,
@@ -130,7 +139,7 @@ def _follow(
                 step.guidance,
                 None if step.prediction is None else lanes_of(step.prediction),
                 view=view,
-                names=[camera.name for camera in drive.cameras],
+                names=names,
                 title=f"frame {number}, {'remembered' if step.remembered else 'seen'}, c = {step.guidance.gate:.2f}",
                 threshold=options.threshold,
             )
@@ -157,12 +166,25 @@ def _detector(options: argparse.Namespace, store: MarkerStore) -> DetectorConfig
 
 
 def _day(options: argparse.Namespace) -> datetime.date:
-    if options.today is None:
-        return datetime.date.today()
-    try:
-        return datetime.date.fromisoformat(options.today)
-    except ValueError:
-        raise UserError(f"--today {options.today} is no day: write it like 2025-07-11") from None
+    return day_of(options.today, "--today") or datetime.date.today()
+
+
+def _doubtful_dates(store: MarkerStore, today: datetime.date, max_age_days: int | None) -> list[str]:
+    """Return a sentence for entries whose age is unknown where it counts, and one for surveys in the future."""
+    told, entries = [], store.markers.values()
+    undated = [entry.marker_id for entry in entries if entry.surveyed is None]
+    if undated and max_age_days is not None:
+        told.append(
+            f"{store.source}: {len(undated)} of {len(entries)} markers have no day of survey (first: {undated[0]}), so "
+            'they count as stale: write "surveyed" into the store, or leave out --max-age-days'
+        )
+    future = [entry for entry in entries if entry.surveyed is not None and entry.surveyed > today]
+    if future:
+        told.append(
+            f"{store.source}: {len(future)} of {len(entries)} markers were surveyed after {today} (first: "
+            f'{future[0].marker_id} on {future[0].surveyed}): correct "surveyed" in the store, or --today'
+        )
+    return told
 
 
 def _age(options: argparse.Namespace) -> int | None:
@@ -172,11 +194,13 @@ def _age(options: argparse.Namespace) -> int | None:
 
 
 def _confidence(step: DriveStep) -> dict[int, float]:
-    markers = step.reading.observed.markers
-    return {int(markers.marker_id[k]): float(step.confidence[k]) for k in np.flatnonzero(markers.valid)}
+    """Return the confidence of each id that gives lanes."""
+    markers, outcomes = step.reading.observed.markers, step.reading.observed.outcomes
+    rows = {int(markers.marker_id[k]): float(step.confidence[k]) for k in np.flatnonzero(markers.valid)}
+    return {number: trust for number, trust in rows.items() if outcomes[number] == "used"}
 
 
-def _record(step: DriveStep, threshold: float) -> dict[str, Any]:
+def _record(step: DriveStep, views: CameraViews, names: Sequence[str], threshold: float) -> dict[str, Any]:
     """Return a frame as plain values."""
     detected, markers, guidance = step.reading.detected, step.reading.observed.markers, step.guidance
     residual = {int(markers.marker_id[k]): float(markers.residual[k]) for k in np.flatnonzero(markers.valid)}
@@ -193,6 +217,8 @@ def _record(step: DriveStep, threshold: float) -> dict[str, Any]:
                 "size": round(float(detected.size[k]), 4),
                 "position": position.round(3).tolist(),
                 "distance": round(float(np.hypot(*position[:2])), 3),
+                "camera": names[int(detected.camera[k])],
+                "corners": board_outline(views, detected, k).round(1).tolist(),
                 **{name: round(value, 4) for name, value in prior.items()},
             }
         )
@@ -220,6 +246,7 @@ def render(options: argparse.Namespace) -> int:
     """Write a drive of the built-in world: images, poses.json and store.json."""
     if options.frames < 1 or not options.scale > 0.0:
         raise UserError("--frames must be at least 1 and --scale positive")
+    surveyed = day_of(options.surveyed, "--surveyed")
     if options.log < 0:
         raise UserError(f"--log is the number of a scene, 0 or more, not {options.log}")
     ring = _RINGS[options.ring]
@@ -229,7 +256,7 @@ def render(options: argparse.Namespace) -> int:
     # Two seconds of history come before the first frame.
     world = WorldConfig(duration_s=1.6 + 0.5 * options.frames, keyframes=options.frames, markers=boards)
     log = simulate(options.log, world)
-    store = store_of_log(log, radius=50.0, bike_lanes=True)
+    store = store_of_log(log, radius=50.0, bike_lanes=True, surveyed=surveyed)
     if not store.markers:
         raise UserError(f"{log.name} has no junction, split or merge, and so no marker: take another --log")
     mounts = ring[: options.cameras]

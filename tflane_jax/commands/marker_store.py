@@ -21,7 +21,7 @@ def run(options: argparse.Namespace) -> int:
     """Write a store, read it back, and print its content."""
     if not options.radius > 0.0:
         raise UserError(f"--radius must be more than 0 m, not {options.radius:g}")
-    surveyed, expires = _day(options.surveyed, "--surveyed"), _day(options.expires, "--expires")
+    surveyed, expires = day_of(options.surveyed, "--surveyed"), day_of(options.expires, "--expires")
     if surveyed is not None and expires is not None and expires <= surveyed:
         raise UserError(f"--expires {expires} must be after --surveyed {surveyed}: before it, no entry would be valid")
     log = _open_log(options.log)
@@ -60,7 +60,8 @@ def _open_log(name: str) -> Log:
     return load_log(Path(name))
 
 
-def _day(text: str | None, option: str) -> datetime.date | None:
+def day_of(text: str | None, option: str) -> datetime.date | None:
+    """Return the day that an option gives, or None; raises UserError for anything else."""
     try:
         return None if text is None else datetime.date.fromisoformat(text)
     except ValueError:

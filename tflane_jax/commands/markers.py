@@ -3,10 +3,12 @@
 `detect` writes one picture for each photo, with the outline and the axes of every marker (x red, y green, z blue), and
 detections.json:
     {"family", "size", "photos": [{"file", "picture", "markers": [{"id", "score", "position", "distance", "turn",
-     "reprojection", "ambiguity", "pose"}, ...]}, ...],
+     "reprojection", "ambiguity", "contradictory", "corners", "pose"}, ...]}, ...],
      "faults": [{"file", "error"}, ...]}
     Position and pose (ego_from_marker, 4 x 4) are in the ego frame, on the ground below the camera: x forward, y left,
-    z up, metres. `faults` are photos that could not be read or are of another size than the intrinsics.
+    z up, metres. Corners of the black square are pixels of the undistorted photo. An id that is read at two places has
+    two entries, both `contradictory`. `faults` are photos that could not be read or are of another size than the
+    intrinsics.
 
 `curves` writes curves-NAME.md and .json for each curve, and curves.png.
 """
@@ -65,7 +67,7 @@ def find(options: argparse.Namespace) -> int:
             raise UserError(f"--{name} takes finite numbers, not nan or inf")
     intrinsics, pose = _intrinsics(options.intrinsics), camera_pose(options.height, np.deg2rad(options.pitch))
     make_folder(options.out)
-    rows, records, faults = [], [], []
+    rows, records, faults, twice = [], [], [], []
     for number, path in enumerate(photos):
         try:
             photo = read_image(path)
@@ -77,18 +79,23 @@ def find(options: argparse.Namespace) -> int:
         found = detect(_views(photo, intrinsics, pose), config)
         picture = f"{number:03d}-{path.stem}-markers.png"
         _write_picture(options.out / picture, photo, found, config.size, intrinsics, pose)
-        here = [_record(found, k) for k in np.flatnonzero(found.valid).tolist()]
+        here = [_record(found, k, intrinsics, pose) for k in np.flatnonzero(found.valid).tolist()]
+        twice += _contradictions(path, here)
         records.append({"file": str(path), "picture": picture, "markers": here})
-        # A pose is too long for a table.
-        shown = [{k: v for k, v in record.items() if k not in ("pose", "position")} for record in here]
         places = [dict(zip("xyz", record["position"], strict=True)) for record in here]
-        rows += [{"photo": path.name} | a | b for a, b in zip(shown, places, strict=True)] or [{"photo": path.name}]
+        remarks = [{"remark": "contradictory"} if record["contradictory"] else {} for record in here]
+        rows += [{"photo": path.name} | a | b | c for a, b, c in zip(here, places, remarks, strict=True)] or [
+            {"photo": path.name}
+        ]
     head = {"family": config.family.name, "size": config.size}
     write_json(options.out / "detections.json", head | {"photos": records, "faults": faults})
     columns = ("photo", "id", "score", "distance", "x", "y", "z", "turn", "reprojection", "ambiguity")
-    full = [{column: row.get(column) for column in columns} for row in rows]
-    print(format_table(full, columns, title=f"{config.family.name}, {config.size:g} m; metres, degrees, pixels"))
+    if twice:
+        columns = (*columns, "remark")
+    print(format_table(rows, columns, title=f"{config.family.name}, {config.size:g} m; metres, degrees, pixels"))
     print(f"\nwritten to {options.out}")
+    for text in twice:
+        print(f"tflane: warning: {text}", file=sys.stderr)
     for fault in faults:
         print(f"tflane: {fault['error']}", file=sys.stderr)
     if faults:
@@ -148,7 +155,23 @@ def _views(
     return CameraViews(photo[None], np.array([[width, height]]), intrinsics[None], pose[None], np.ones(1, bool))
 
 
-def _record(found: DetectedMarkers, k: int) -> dict[str, Any]:
+def _contradictions(photo: Path, records: list[dict[str, Any]]) -> list[str]:
+    """Return one sentence for each id that a photo shows at several places."""
+    places: dict[int, list[str]] = {}
+    for record in records:
+        if record["contradictory"]:
+            x, y, _ = record["position"]
+            places.setdefault(record["id"], []).append(f"({x:.1f}, {y:.1f})")
+    return [
+        f"{photo}: marker {number} is at several places, x and y {' and '.join(several)} m: give each board an id of "
+        "its own, or leave out the one that is not surveyed"
+        for number, several in places.items()
+    ]
+
+
+def _record(
+    found: DetectedMarkers, k: int, intrinsics: Float[np.ndarray, "3 3"], camera_from_ego: Float[np.ndarray, "4 4"]
+) -> dict[str, Any]:
     pose = np.asarray(found.pose[k], np.float64)
     # 0 if the marker faces back along x, positive if it is turned to its own left.
     turn = np.rad2deg(np.arctan2(-pose[1, 2], -pose[0, 2]))
@@ -159,6 +182,8 @@ def _record(found: DetectedMarkers, k: int) -> dict[str, Any]:
         "turn": round(float(turn), 2),
         "reprojection": round(float(found.reprojection[k]), 4),
         "ambiguity": round(float(found.ambiguity[k]), 4),
+        "contradictory": bool(found.contradictory[k]),
+        "corners": marker_outline(pose, float(found.size[k]), intrinsics, camera_from_ego).round(1).tolist(),
         "position": np.round(pose[:3, 3], 4).tolist(),
         "pose": np.round(pose, 6).tolist(),
     }
@@ -175,6 +200,7 @@ def _write_picture(
     cv2 = opencv()
     image = np.ascontiguousarray(photo)
     width = max(1, round(max(image.shape) / 900))
+    font = cv2.FONT_HERSHEY_SIMPLEX, 0.5 * width, width
 
     def fixed(pixels: np.ndarray) -> np.ndarray:
         return np.round((np.clip(pixels, -8000.0, 8000.0) - 0.5) * 16).astype(np.int32)
@@ -188,8 +214,18 @@ def _write_picture(
         for axis in np.flatnonzero(ahead[1:]).tolist():
             start, end = fixed(pixels[[0, axis + 1]]).tolist()
             cv2.line(image, start, end, _AXES[axis].tolist(), 2 * width, cv2.LINE_AA, 4)
-        low = outline.max(0)
         words = f"{found.marker_id[k]}: {np.linalg.norm(pose[:2, 3]):.1f} m, {found.score[k]:.2f}"
-        place = (int(outline[:, 0].min()), int(low[1]) + 16 * width)
-        cv2.putText(image, words, place, cv2.FONT_HERSHEY_SIMPLEX, 0.5 * width, _OUTLINE, width, cv2.LINE_AA)
+        place = _label_place(outline, cv2.getTextSize(words, *font)[0], image.shape[1::-1], 4 * width)
+        cv2.putText(image, words, place, font[0], font[1], _OUTLINE, font[2], cv2.LINE_AA)
     write_bytes(path, cv2.imencode(".png", image[..., ::-1])[1].tobytes())
+
+
+def _label_place(
+    outline: Float[np.ndarray, "4 2"], text: tuple[int, int], size: tuple[int, int], gap: int
+) -> tuple[int, int]:
+    """Return the lower left corner of a label: below the board, above it where there is no room, in the picture."""
+    low, high = outline.min(0), outline.max(0)
+    left = min(low[0], size[0] - text[0] - gap)
+    below = high[1] + gap + text[1]
+    bottom = below if below + gap <= size[1] else low[1] - gap
+    return int(max(left, 0)), int(np.clip(bottom, text[1], size[1] - gap))

@@ -11,7 +11,7 @@ import numpy as np
 from tflane_jax.datasets.map_lines import MapLinesConfig
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import BevGrid, PerceptionRange
-from tflane_jax.limits import Count, Positive, at_least
+from tflane_jax.limits import Count, Positive, SettingError, at_least
 from tflane_jax.markers.pixels import PixelConfig
 from tflane_jax.markers.simulation import MarkerConfig
 from tflane_jax.scene import Example, RoadImage
@@ -79,7 +79,9 @@ class ExampleConfig:
 
     def __post_init__(self) -> None:
         """Replace the short form "pixels" of `markers`."""
-        if isinstance(self.markers, str) and self.markers == "pixels":
+        if isinstance(self.markers, str):
+            if self.markers != "pixels":
+                raise SettingError("markers", self.markers, "a MarkerConfig, 'pixels' or None")
             object.__setattr__(self, "markers", MarkerConfig(pixels=PixelConfig()))
 
     @property

@@ -6,40 +6,36 @@ whole, so a subset takes minutes. Both subsets may share the folder: every segme
 
 from __future__ import annotations
 
-import re
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
-from tflane_jax.datasets.base import SPLITS, ExampleConfig, Split
+from tflane_jax.datasets.base import SPLITS, ExampleConfig
 from tflane_jax.datasets.openlane_annotation import Annotation, read_annotation
 from tflane_jax.datasets.openlane_check_cameras import CameraChecks, Images
 from tflane_jax.datasets.openlane_check_collections import check_collections
+from tflane_jax.datasets.openlane_check_files import frames_on_disk, named_frames, subsets_of
 from tflane_jax.datasets.openlane_frames import (
     SUBSETS,
     FrameFile,
     SubsetName,
-    frames_of,
     info_path,
     read_frame,
     source_logs,
 )
+from tflane_jax.datasets.openlane_sd_map import FILE, read_sd_lines, sd_map_path
 from tflane_jax.datasets.openlane_tracks import SourceTracks, listed
 from tflane_jax.datasets.plausible import check_motion
 from tflane_jax.errors import UserError
-from tflane_jax.files.fields import load_json, member
 from tflane_jax.files.openlane import CENTERLINE, SEGMENT, FrameKey
 from tflane_jax.progress import progress_bar
 
-# Frames of a segment that are read to find its subset.
-_TRIED = 3
-_FRAME_FILE = re.compile(r"(\d+)(-ls)?\.json")
 _WITH_LOG, _WITHOUT_LOG, _WITH_TRAFFIC = "with log", "without log", "with traffic"
-_COUNTS = ("segments", "frames", "-ls files", "images", "lanes", "lane segments", "elements", "areas")
+_COUNTS = ("segments", "frames", "-ls files", "images", "lanes", "lane segments", "elements", "areas", "SD maps")
 
 
 @dataclass(frozen=True)
@@ -81,10 +77,10 @@ def check_openlane_v2(
     Raises UserError where there is no frame at all, or `tracks` holds no log.
     """
     root, faults, skipped = Path(root), [], []
-    named, on_disk = _named_frames(root, faults), _frames_on_disk(root, skipped)
+    named, on_disk = named_frames(root, faults), frames_on_disk(root, skipped)
     if not any(on_disk.values()):
         raise UserError(f"{root} holds no <split>/<segment>/info/<timestamp>.json: is it OpenLane-V2's folder?")
-    subsets = _subsets(root, on_disk)
+    subsets = subsets_of(root, on_disk)
     present: list[SubsetName] = sorted(set(subsets.values()))
     rows = []
     for split in SPLITS:
@@ -104,6 +100,7 @@ def check_openlane_v2(
             logs = None if tracks is None else _logs(root, there, subset, tracks, alone=len(present) == 1)
             counts = _check_frames(root, there, subset, logs, CameraChecks(images), cameras, faults, progress)
             counts["segments"] = len({key.segment for key in keys})
+            counts["SD maps"] = _check_sd_maps(root, there, faults)
             content = counts if tracks is None else _with_share(counts)
             if logs is not None and (lacking := logs.lacking(there)):
                 skipped.append(
@@ -143,81 +140,14 @@ def _check_frames(
             if camera is None and cameras == "all":
                 lacking.setdefault((key.scene, name), []).append(key)
         before = (key, frame)
+    strange, of_cameras = images.finish()
+    counts["images"] -= strange
+    faults += of_cameras
     faults += [
         f"{root / scene}: {len(of)} frames have no camera {name} (first {of[0]})"
         for (scene, name), of in lacking.items()
     ]
     return counts
-
-
-def _named_frames(root: Path, faults: list[str]) -> dict[Split, list[FrameKey]]:
-    """Return the frames that any split file names."""
-    named: dict[Split, list[FrameKey]] = {split: [] for split in SPLITS}
-    for file in sorted(root.glob("data_dict_*.json")):
-        try:
-            content = load_json(file)
-            for split in SPLITS:
-                if isinstance(content, Mapping) and split not in content:
-                    continue
-                keys = frames_of(content, split, str(file))
-                faults += [
-                    f"{file}: {key} has no whole number as its timestamp"
-                    for key in keys
-                    if not key.timestamp.isdecimal()
-                ]
-                named[split] += [key for key in keys if key.timestamp.isdecimal()]
-        except UserError as error:
-            faults.append(str(error))
-    return named
-
-
-def _frames_on_disk(root: Path, skipped: list[str]) -> dict[Split, list[FrameKey]]:
-    """Return the frames in the folders; files that are no frames are skipped and named."""
-    found: dict[Split, list[FrameKey]] = {}
-    for split in SPLITS:
-        keys = set()
-        for path in (root / split).glob("*/info/*"):
-            name = _FRAME_FILE.fullmatch(path.name)
-            if name is None:
-                skipped.append(f"{path} is no frame's file (<timestamp>.json or <timestamp>-ls.json)")
-            else:
-                keys.add(FrameKey(split, path.parent.parent.name, name[1]))
-        segments = (root / split).glob("*")
-        skipped += [f"{path} is no segment: it has no info folder" for path in segments if not (path / "info").is_dir()]
-        found[split] = sorted(keys, key=lambda key: (key.segment, int(key.timestamp)))
-    skipped.sort()
-    return found
-
-
-def _subsets(root: Path, on_disk: Mapping[Split, list[FrameKey]]) -> dict[tuple[str, str], SubsetName]:
-    """Return the subset of each (split, segment), by the cameras of its first readable frames; else that of others."""
-    found: dict[tuple[str, str], SubsetName | None] = {}
-    tried: Counter[tuple[str, str]] = Counter()
-    for key in (key for keys in on_disk.values() for key in keys):
-        segment = key.split, key.segment
-        if found.get(segment) is None and tried[segment] < _TRIED:
-            tried[segment] += 1
-            found[segment] = _subset(root, key)
-    known: list[SubsetName] = [subset for subset in found.values() if subset is not None]
-    other = known[0] if known else "A"
-    return {segment: other if subset is None else subset for segment, subset in found.items()}
-
-
-def _subset(root: Path, key: FrameKey) -> SubsetName | None:
-    """Return the subset most of whose cameras the frame has; None if it can be read as neither."""
-    for suffix in (CENTERLINE.suffix, SEGMENT.suffix):
-        try:
-            sensors = member(load_json(info_path(root, key, suffix)), "sensor", "")
-        except UserError:
-            continue
-        if isinstance(sensors, Mapping):
-            shared: dict[SubsetName, int] = {
-                name: len({*subset.cameras} & {*map(str, sensors)}) for name, subset in SUBSETS.items()
-            }
-            best: SubsetName = "A" if shared["A"] >= shared["B"] else "B"
-            if shared[best]:
-                return best
-    return None
 
 
 def _check_frame(
@@ -251,12 +181,31 @@ def _check_frame(
             elements = len(found.boxes)
         if first is None:
             first = frame
-            intact, of_cameras = images.check(frame)
+            intact, damaged = images.check(frame)
             counts["images"] += intact
-            faults += of_cameras
+            faults += damaged
         elif not np.allclose(first.global_from_ego, frame.global_from_ego):
             faults.append(f"{path} has another pose than its centerline twin")
     return first
+
+
+def _check_sd_maps(root: Path, keys: list[FrameKey], faults: list[str]) -> int:
+    """Check the SD maps of a split's segments and return how many can be read; a split may have none."""
+    segments = {key.scene: sd_map_path(root, key) for key in keys}
+    lacking, read = [scene for scene, path in segments.items() if not path.is_file()], 0
+    for scene, path in segments.items():
+        if scene not in lacking:
+            try:
+                read_sd_lines(path)
+                read += 1
+            except UserError as error:
+                faults.append(str(error))
+    if 0 < len(lacking) < len(segments):
+        faults.append(
+            f"{root}: {len(lacking)} of {len(segments)} segments have no {FILE} (first {lacking[0]}): unpack the SD "
+            "maps again"
+        )
+    return read
 
 
 def _check_annotation(found: Annotation) -> Iterator[str]:

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import re
 import struct
+from collections import Counter, defaultdict
+from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Literal
 
@@ -36,7 +38,7 @@ _MOUNTS = {mount.name: mount for mount in (*ARGOVERSE2_RING, *NUSCENES_RING)}
 
 
 class CameraChecks:
-    """Checks frame by frame; the images of a camera should all have the size of its first one.
+    """Checks frame by frame; the images of a camera should all have the size of most.
 
     Args:
         images: see `Images`.
@@ -44,26 +46,63 @@ class CameraChecks:
 
     def __init__(self, images: Images = "ends"):
         self._images: Images = images
-        self._sizes: dict[str, tuple[int, int]] = {}
+        self._sizes: dict[str, Counter[tuple[int, int]]] = defaultdict(Counter)
+        self._strange: dict[tuple[Path, str, tuple[int, int]], _Repeated] = {}
+        self._calibration: dict[tuple[Path, str, str, tuple[int, int] | None], _Repeated] = {}
 
     def check(self, frame: FrameFile) -> tuple[int, list[str]]:
-        """Return how many of a frame's images are intact, and its faults."""
+        """Return how many of a frame's images can be read, and the faults of the others."""
         intact, faults = 0, []
         for camera in frame.cameras:
             if camera is None:
                 continue
             fault = _damage(camera.image, self._images)
             size = None if fault else image_size(camera.image)
-            if size is not None and size != self._sizes.setdefault(camera.name, size):
-                first = self._sizes[camera.name]
-                fault = f"is {size[0]} x {size[1]} pixels, the first image of {camera.name} is {first[0]} x {first[1]}"
             intact += fault is None
             faults += [] if fault is None else [f"{camera.image} {fault}"]
+            segment = frame.path.parent.parent
+            if size is not None:
+                self._sizes[camera.name][size] += 1
+                self._strange.setdefault((segment, camera.name, size), _Repeated(str(camera.image))).count += 1
             where = f"{frame.path}: {camera.name}"
-            scale = None if fault else _scale(camera, size)
-            every = _direction(camera), _place(camera), scale
-            faults += [f"{where} {found}" for found in every if found is not None]
+            every = {"direction": _direction(camera), "place": _place(camera), "scale": _scale(camera, size)}
+            for kind, found in every.items():
+                if found is not None:
+                    key = (segment, camera.name, kind, size if kind == "scale" else None)
+                    self._calibration.setdefault(key, _Repeated(f"{where} {found}")).count += 1
         return intact, faults
+
+    def finish(self) -> tuple[int, list[str]]:
+        """Return how many images have another size than most, and the faults of sizes and calibrations.
+
+        A fault of several frames of a segment is one, with their number.
+        """
+        usual = {name: sizes.most_common(1)[0][0] for name, sizes in self._sizes.items()}
+        strange, faults = 0, []
+        for (_, name, size), found in self._strange.items():
+            if size != usual[name]:
+                strange += found.count
+                most = f"{usual[name][0]} x {usual[name][1]}"
+                text = f"{found.text} is {size[0]} x {size[1]} pixels, most images of {name} are {most}"
+                faults.append(text + found.others("images"))
+        # The intrinsics fit the usual images.
+        faults += [
+            found.text + found.others("frames")
+            for (_, name, _, size), found in self._calibration.items()
+            if size is None or size == usual[name]
+        ]
+        return strange, faults
+
+
+@dataclass
+class _Repeated:
+    """A fault as first found in a segment, and how often it was."""
+
+    text: str
+    count: int = 0
+
+    def others(self, what: str) -> str:
+        return "" if self.count == 1 else f" ({self.count} {what} of the segment)"
 
 
 def image_size(path: Path) -> tuple[int, int] | None:
@@ -137,9 +176,23 @@ def _direction(camera: FrameCamera) -> str | None:
     text = f"looks to {looks:.0f} degrees (left of ahead), expected about {expected:.0f}"
     if expected == 0.0:
         text = f"does not look ahead but to {looks:.0f} degrees"
+    if _inverted(camera, mount.yaw):
+        return (
+            f"{text}: is its extrinsic from the ego frame to the camera, instead of from the camera to the ego frame?"
+        )
     if other is not None:
         return f"{text}, where {other} should look: are their calibrations swapped?"
-    return f"{text}: is its extrinsic from the ego frame to the camera, instead of from the camera to the ego frame?"
+    return f"{text}: is its extrinsic that of the camera's axes (x right, y down, z ahead) in the ego frame?"
+
+
+def _inverted(camera: FrameCamera, yaw: float) -> bool:
+    """Return whether a camera stands upright and looks along a yaw only by the inverse of its extrinsic."""
+    rotation, down = camera.ego_from_camera[:3, :3], np.array([0.0, 0.0, -1.0])
+
+    def upright(axes: Float[np.ndarray, "3 3"]) -> bool:
+        return bool(axes[:, 1] @ down >= np.cos(np.deg2rad(_TURNED)))
+
+    return upright(rotation.T) and not upright(rotation) and _apart(rotation[2], yaw) <= _TURNED
 
 
 def _others(axis: Float[np.ndarray, "3"], name: str) -> str | None:
@@ -173,6 +226,12 @@ def _scale(camera: FrameCamera, size: tuple[int, int] | None) -> str | None:
     central = (np.abs(middle - 0.5) <= _ASIDE).all() and _FOCAL[0] <= focal <= _FOCAL[1]
     if central and _relative(camera, size) <= _NOMINAL:
         return None
+    fx, fy = camera.intrinsics[0, 0], camera.intrinsics[1, 1]
+    if central and abs(fy / fx - 1.0) > _NOMINAL:
+        return (
+            f"has focal lengths of {fx:.0f} pixels along the width and {fy:.0f} along the height of images of "
+            f"{size[0]} x {size[1]}, expected the same: is the matrix damaged, or were its images stretched?"
+        )
     if central:
         nominal = _MOUNTS[camera.name]
         return (
@@ -187,12 +246,15 @@ def _scale(camera: FrameCamera, size: tuple[int, int] | None) -> str | None:
 
 
 def _relative(camera: FrameCamera, size: tuple[int, int]) -> float:
-    """Return how far the focal length is from that of the dataset's cameras of this name, as a fraction.
+    """Return how far the focal lengths are from that of the dataset's cameras of this name, as a fraction.
 
-    In widths or in heights of the image, whichever is nearer: one of them may have been cropped or padded.
+    In widths or in heights of the image, whichever is nearer: one of them may have been cropped or padded. Two focal
+    lengths are of a stretched image: each is compared along its own side.
     """
     mount = _MOUNTS.get(camera.name)
     if mount is None:
         return 0.0
-    found = camera.intrinsics[0, 0] / np.array(size)
-    return float(np.abs(found / (mount.focal / np.array([mount.width, mount.height])) - 1.0).min())
+    focal, nominal = np.diag(camera.intrinsics)[:2], mount.focal / np.array([mount.width, mount.height])
+    if abs(focal[1] / focal[0] - 1.0) > _NOMINAL:
+        return float(np.abs(focal / size / nominal - 1.0).max())
+    return float(np.abs(focal[0] / np.array(size) / nominal - 1.0).min())

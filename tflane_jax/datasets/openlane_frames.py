@@ -22,7 +22,7 @@ from tflane_jax.datasets.base import SPLITS, Split
 from tflane_jax.datasets.plausible import FARTHEST, MOST_PIXELS
 from tflane_jax.errors import UserError
 from tflane_jax.files.fields import file_within, is_time, items, load_json, load_members, member, numbers
-from tflane_jax.files.openlane import FrameKey
+from tflane_jax.files.openlane import CENTERLINE, SEGMENT, FrameKey
 from tflane_jax.geometry import pose_matrix
 
 SubsetName = Literal["A", "B"]
@@ -127,8 +127,8 @@ def list_frames(root: Path, split: str, subset: SubsetName, data_dict: str | Non
         root: of the dataset.
         split: train, val or test.
         subset: its split file is the default.
-        data_dict: name of a split file under `root`; "folders" lists the folders instead. None takes the subset's split
-            file if it exists, else lists the folders.
+        data_dict: name of a split file under `root`; "folders" lists the folders instead, without the segments of the
+            other subset. None takes the subset's split file if it exists, else lists the folders.
 
     Raises:
         UserError: a folder or split file that is missing, is damaged, or names no frame of this split.
@@ -142,6 +142,7 @@ def list_frames(root: Path, split: str, subset: SubsetName, data_dict: str | Non
             others = [name for name in SPLITS if _in_folders(root, name)]
             remedy = _instead(split, others) if others else ": is it OpenLane-V2's folder?"
             raise UserError(f"{root} holds no {split}/<segment>/info/<timestamp>.json{remedy}")
+        keys = _of_subset(root, keys, subset)
     else:
         content = load_json(file)
         others = [name for name in SPLITS if isinstance(content, Mapping) and content.get(name) and name != split]
@@ -150,6 +151,34 @@ def list_frames(root: Path, split: str, subset: SubsetName, data_dict: str | Non
             remedy = _instead(split, others) if others else ": choose another split"
             raise UserError(f"{file} names no frame of split {split}{remedy}, or another split file (data_dict)")
     return sorted(set(keys), key=lambda key: (key.segment, _time(key, root)))
+
+
+def _of_subset(root: Path, keys: list[FrameKey], subset: SubsetName) -> list[FrameKey]:
+    """Return frames without those of the other subset's segments; all where there are no others, for an error."""
+    subsets: dict[str, SubsetName | None] = {}
+    for key in sorted(keys):
+        if key.segment not in subsets:
+            subsets[key.segment] = subset_of_frame(root, key)
+    kept = [key for key in keys if subsets[key.segment] in (subset, None)]
+    return kept or keys
+
+
+def subset_of_frame(root: Path, key: FrameKey) -> SubsetName | None:
+    """Return the subset most of whose cameras a frame has; None if it can be read as neither."""
+    for suffix in (CENTERLINE.suffix, SEGMENT.suffix):
+        path = info_path(root, key, suffix)
+        try:
+            sensors = member(load_members(path, ("sensor",)), "sensor", str(path))
+        except UserError:
+            continue
+        if isinstance(sensors, Mapping):
+            shared: dict[SubsetName, int] = {
+                name: len({*subset.cameras} & {*map(str, sensors)}) for name, subset in SUBSETS.items()
+            }
+            best: SubsetName = "A" if shared["A"] >= shared["B"] else "B"
+            if shared[best]:
+                return best
+    return None
 
 
 def _in_folders(root: Path, split: str) -> list[FrameKey]:

@@ -31,6 +31,7 @@ CATEGORIES: Mapping[str, SdCategory] = {
     "side_walk": SdCategory.CROSSWALK,
 }
 """SMERF's category of each of OpenLane-V2's; it counts all ways of pedestrians as one."""
+_REMEDY = "unpack the SD maps of OpenLane-V2 (a download of their own), or train without (data.example.sd_map None)"
 _NAMES = {SdCategory.ROAD: "road", SdCategory.CROSSWALK: "cross_walk"}
 
 
@@ -53,10 +54,7 @@ def read_sd_lines(path: Path) -> SdLines:
     Raises UserError where the file is missing or damaged.
     """
     if not path.is_file():
-        raise UserError(
-            f"{path} is missing: unpack the SD maps of OpenLane-V2 (a download of their own), or train without "
-            "(data.example.sd_map None)"
-        )
+        raise UserError(f"{path} is missing: {_REMEDY}")
     lines, category = [], []
     for i, record in enumerate(as_list(load_json(path), str(path))):
         where = f"{path}: [{i}]"
@@ -99,15 +97,22 @@ def frame_sd_map(found: SdLines, global_from_ego: Float[np.ndarray, "4 4"], conf
 
 
 class SegmentSdMaps:
-    """The SD maps of a dataset's segments, each read once.
+    """The SD maps of a dataset's segments, each read once, when its first frame is.
 
     Args:
         root: of the dataset.
+        keys: frames whose segments must have the file.
+
+    Raises UserError where files are missing.
     """
 
-    def __init__(self, root: Path):
+    def __init__(self, root: Path, keys: Sequence[FrameKey]):
         self._root = root
         self._read: dict[str, SdLines] = {}
+        segments = {key.scene: sd_map_path(root, key) for key in keys}
+        missing = [path for path in segments.values() if not path.is_file()]
+        if missing:
+            raise UserError(f"{len(missing)} of {len(segments)} SD maps are missing ({missing[0]}, ...): {_REMEDY}")
 
     def around(self, key: FrameKey, global_from_ego: Float[np.ndarray, "4 4"], config: SdMapConfig) -> SdMap:
         """Return the SD map around a frame; see `read_sd_lines` and `frame_sd_map`."""

@@ -133,7 +133,7 @@ class OpenLaneV2Dataset:
             self._tracks = SourceTracks(config.tracks, config.subset, logs)
             self.keys = self._tracks.known(self.keys, config.without_tracks)
         self._poses: dict[int, np.ndarray] = {}
-        self._sd_maps = SegmentSdMaps(self.root)
+        self._sd_maps = None if config.example.sd_map is None else SegmentSdMaps(self.root, self.keys)
         self._first: dict[str, int] = {}
         for index, key in enumerate(self.keys):
             self._first.setdefault(key.scene, index)
@@ -172,7 +172,9 @@ class OpenLaneV2Dataset:
             markers=None
             if self._boards is None
             else self._boards.observations(key.scene, index - self._first[key.scene]),
-            sd_map=None if config.sd_map is None else self._sd_maps.around(key, pose, config.sd_map),
+            sd_map=None
+            if self._sd_maps is None or config.sd_map is None
+            else self._sd_maps.around(key, pose, config.sd_map),
             lanes=lanes,
             segments=segments,
             areas=areas,

@@ -27,6 +27,8 @@ _APART, _APART_SHARE = 1.0, 0.2
 class DetectedMarkers(NamedTuple):
     """Markers found in the images of one frame, by descending score; rows that are not valid are padding.
 
+    An id has one row, or one for each board that carries it; those are `contradictory`.
+
     Attributes:
         marker_id: (M,) int32.
         pose: (M, 4, 4) ego_from_marker, metres (frame: `tflane_jax.markers`).
@@ -35,7 +37,8 @@ class DetectedMarkers(NamedTuple):
         ambiguity: (M,) 0 (only one pose fits) to 1 (both fit equally well).
         camera: (M,) int32 index of the view it was detected in.
         size: (M,) side of the black square that the pose rests on, metres.
-        contradictory: (M,) the id was read at another place too, so that one of the boards is not the surveyed one.
+        contradictory: (M,) the id was read at another place too (another row, if the capacity allows), so that one of
+            the boards is not the surveyed one.
         valid: (M,).
     """
 
@@ -61,7 +64,7 @@ class DetectedMarkers(NamedTuple):
 def detect(
     views: CameraViews, config: DetectorConfig = DetectorConfig(), sizes: Mapping[int, float] | None = None
 ) -> DetectedMarkers:
-    """Return the markers in all images of a frame; an id detected several times is reported once, with its best score.
+    """Return the markers in all images of a frame; a board in several cameras is reported once, with its best score.
 
     Invalid views, and pixels beyond a view's size, are ignored. Raises UserError without OpenCV or for an invalid
     config.
@@ -81,9 +84,9 @@ def locate(
     config: DetectorConfig = DetectorConfig(),
     sizes: Mapping[int, float] | None = None,
 ) -> DetectedMarkers:
-    """Return the markers of a frame from what was found in its images; an id found several times is reported once.
+    """Return the markers of a frame from what was found in its images; a board found several times is reported once.
 
-    The one with the best score is reported.
+    The sighting with the best score is reported. Two boards with one id are both reported, as `contradictory`.
 
     Args:
         views: of the frame; only calibration and validity are used.
@@ -106,15 +109,15 @@ def locate(
             seen = _Sighting(score, pose, float(fit.error[0]), fit.ambiguity, number, size)
             sightings.setdefault(marker_id, []).append(seen)
     answer = DetectedMarkers.empty(config.capacity)
-    chosen = {marker_id: max(seen, key=lambda each: each.score) for marker_id, seen in sightings.items()}
+    boards = {marker_id: _boards(seen) for marker_id, seen in sightings.items()}
+    chosen = [(marker_id, best) for marker_id, several in boards.items() for best in several]
     # Ties are broken by id, so that the result does not depend on the order of the views.
-    order = sorted(chosen, key=lambda marker_id: (-chosen[marker_id].score, marker_id))[: config.capacity]
-    for place, marker_id in enumerate(order):
-        best = chosen[marker_id]
+    order = sorted(chosen, key=lambda each: (-each[1].score, each[0]))[: config.capacity]
+    for place, (marker_id, best) in enumerate(order):
         answer.marker_id[place], answer.pose[place], answer.score[place] = marker_id, best.pose, best.score
         answer.reprojection[place], answer.ambiguity[place] = best.error, best.ambiguity
         answer.camera[place], answer.size[place], answer.valid[place] = best.camera, best.size, True
-        answer.contradictory[place] = any(_elsewhere(best, other) for other in sightings[marker_id])
+        answer.contradictory[place] = len(boards[marker_id]) > 1
     return answer
 
 
@@ -129,10 +132,17 @@ class _Sighting(NamedTuple):
     size: float
 
 
+def _boards(sightings: Sequence[_Sighting]) -> list[_Sighting]:
+    """Return the best sighting of each board with an id."""
+    boards: list[_Sighting] = []
+    for seen in sorted(sightings, key=lambda each: -each.score):
+        if all(_elsewhere(seen, other) for other in boards):
+            boards.append(seen)
+    return boards
+
+
 def _elsewhere(a: _Sighting, b: _Sighting) -> bool:
     """Return whether two sightings of an id are two boards."""
-    if a is b:
-        return False
     if a.camera == b.camera:
         return True
     far = max(np.linalg.norm(a.pose[:3, 3]), np.linalg.norm(b.pose[:3, 3]))

@@ -17,9 +17,9 @@ from tflane_jax.geometry import PerceptionRange, clip_to_range, nearest_lines, r
 from tflane_jax.markers.store import MarkerStore, StoredMarker, look_up
 from tflane_jax.scene import MarkerObservations
 
-Outcome = Literal["used", "unknown", "stale", "contradictory", "dropped"]
+Outcome = Literal["used", "unknown", "stale", "contradictory", "dropped", "no lanes"]
 """What became of a detected marker: it gives a prior; its id is not in the store; its entry is out of date; its id was
-read at two places; there were too many nearer ones."""
+read at two places; there were too many nearer ones; its entry has no lanes."""
 
 
 class Detected(Protocol):
@@ -109,7 +109,10 @@ def observe(
     contradictory = len(outcomes)
     looked = look_up(store, ids[rows], today=today, max_age_days=max_age_days)
     for row, entry in zip(rows, looked.found, strict=True):
-        outcomes[int(ids[row])] = "used" if entry else "stale" if int(ids[row]) in store.markers else "unknown"
+        number = int(ids[row])
+        outcomes[number] = "stale" if number in store.markers else "unknown"
+        if entry is not None:
+            outcomes[number] = "used" if len(entry.lanes) else "no lanes"
     known = [(row, entry) for row, entry in zip(rows, looked.found, strict=True) if entry is not None]
     poses = {int(row): np.asarray(detected.pose[row], np.float64) for row, _ in known}
     known.sort(key=lambda pair: np.hypot(*poses[int(pair[0])][:2, 3]))

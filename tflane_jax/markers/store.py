@@ -17,6 +17,9 @@ from jaxtyping import Bool, Float
 from tflane_jax.geometry import invert_pose, resample_lines, transform_points
 from tflane_jax.scene.logs import LaneSegment, PlacedMarkers
 
+# Pieces of lanes that are shorter are left out, metres: they would have no length in a file.
+_SHORTEST = 0.01
+
 
 class UnknownMarkerWarning(UserWarning):
     """A detected marker is not in the store."""
@@ -204,4 +207,4 @@ def _clip_to_circle(
     pieces = [
         np.concatenate([a[i : i + 1] + enter[i] * step[i], stop[i : j + 1]]) for i, j in zip(first, last, strict=True)
     ]
-    return [p for p in pieces if (p[1:, :2] != p[:-1, :2]).any()]
+    return [p for p in pieces if np.ptp(p[:, :2], axis=0).max() > _SHORTEST]

@@ -32,6 +32,8 @@ _LARGEST_ID = 2**31 - 1
 _MOST_LANES = 1000
 # Limits of lengths, metres: coordinates of a map, distance of a lane from its marker.
 _MAP, _LANES = 1e8, 1e5
+# Shortest lane, metres: half of what a file's decimals can tell.
+_SHORTEST = 0.0005
 
 
 def save_store(store: MarkerStore, path: Path, *, frame: Literal["marker", "survey"] = "marker") -> Path:
@@ -118,6 +120,9 @@ def _read_marker(entry: Any, number: int, unit: float, frame: str, where: str) -
     _within(lanes, _MAP if frame == "survey" else _LANES, f"{where}: lanes")
     if len(lanes) and lanes.shape[1] < 2:
         raise UserError(f"{where}: lanes have {lanes.shape[1]} points, expected at least 2")
+    empty = np.flatnonzero(np.linalg.norm(np.diff(lanes, axis=1), axis=-1).sum(-1) < _SHORTEST)
+    if len(empty):
+        raise UserError(f"{where}: lanes[{empty[0]}] has no length, all its points are one: leave the lane out")
     if frame == "survey":
         lanes = transform_points(invert_pose(pose), lanes.reshape(-1, 3)).reshape(lanes.shape)
         _within(lanes, _LANES, f"{where}: lanes")

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.special import expit
 
 from tflane_jax.geometry import PerceptionRange
@@ -34,6 +34,8 @@ _CAMERAS, _PIXELS = 3, 900
 _SMALL = 0.1
 # Size of labels, points; half the length and height of one, as a fraction of the panel's width.
 _FONT, _LABEL = 6, np.array([0.06, 0.016])
+# Height of a label in an image, as a fraction of the image's.
+_LINE = 0.06
 # Boards by what became of them; lanes of a marker from no to full confidence.
 OUTCOMES: dict[Outcome, str] = {
     "used": "#34c759",
@@ -41,6 +43,7 @@ OUTCOMES: dict[Outcome, str] = {
     "stale": "#ff9d3c",
     "contradictory": "#ff3b30",
     "dropped": "#c8ccd4",
+    "no lanes": "#5ac8fa",
 }
 _DOUBTED, _TRUSTED = np.array([0.45, 0.30, 0.36]), np.array([1.0, 0.93, 0.35])
 
@@ -62,8 +65,8 @@ def save_drive_frame(
     """Write one frame and return the path.
 
     A board's colour is its outcome (green used, yellow unknown, orange out of date, red read at two places, grey one
-    too many), its label id, outcome and confidence. Lanes of markers are yellow, the darker the less they are trusted;
-    predicted lanes are blue.
+    too many, light blue without lanes in the store), its label id, outcome and confidence. Lanes of markers are yellow,
+    the darker the less they are trusted; predicted lanes are blue.
 
     Args:
         path: .png, .pdf or .svg.
@@ -200,7 +203,7 @@ def _at_scale(views: CameraViews, factor: int) -> CameraViews:
 def _magnify(ax: Axes, views: CameraViews, number: int, detected: DetectedMarkers, k: int) -> None:
     """Show a board that is too small to be recognised in the picture, in the corner on the other side of it."""
     width, height = np.asarray(views.size)[number].tolist()
-    outline = _outline(views, number, detected, k)
+    outline = board_outline(views, detected, k)
     side, (x, y) = float((outline.max(0) - outline.min(0)).max()), outline.mean(0).tolist()
     if side > _SMALL * width:
         return
@@ -216,7 +219,9 @@ def _magnify(ax: Axes, views: CameraViews, number: int, detected: DetectedMarker
     inset.spines[:].set_color("white")
 
 
-def _outline(views: CameraViews, number: int, detected: DetectedMarkers, k: int) -> Float[np.ndarray, "4 2"]:
+def board_outline(views: CameraViews, detected: DetectedMarkers, k: int) -> Float[np.ndarray, "4 2"]:
+    """Return the pixels of a detected board's corners in its camera."""
+    number = int(detected.camera[k])
     intrinsics = np.asarray(views.intrinsics, np.float64)[number]
     camera_from_ego = np.asarray(views.camera_from_ego, np.float64)[number]
     return marker_outline(
@@ -236,22 +241,34 @@ def _draw_board(
     intrinsics = np.asarray(views.intrinsics, np.float64)[number]
     camera_from_ego = np.asarray(views.camera_from_ego, np.float64)[number]
     pose, marker = np.asarray(detected.pose[k], np.float64), int(detected.marker_id[k])
-    outline = _outline(views, number, detected, k)
+    outline = board_outline(views, detected, k)
     colour = OUTCOMES[outcomes[marker]]
     ax.plot(*np.concatenate([outline, outline[:1]]).T, color=colour, linewidth=1.2, zorder=4.0)
     foot = project(pose[None, :3, 3] - [0.0, 0.0, float(detected.size[k])], intrinsics, camera_from_ego)[0][0]
-    label = _label(marker, outcomes, confidence)
+    place, ha, va = _in_picture(foot, outline, np.asarray(views.size)[number])
     ax.annotate(
-        label,
-        foot,
+        _label(marker, outcomes, confidence),
+        place,
         color=colour,
         fontsize=_FONT,
-        ha="center",
-        va="top",
+        ha=ha,
+        va=va,
         path_effects=_outlined(),
         zorder=4.1,
         clip_on=True,
     )
+
+
+def _in_picture(
+    foot: Float[np.ndarray, "2"], outline: Float[np.ndarray, "4 2"], size: Int[np.ndarray, "2"]
+) -> tuple[tuple[float, float], Literal["left", "center", "right"], Literal["bottom", "top"]]:
+    """Return place and alignment of a board's label: below it, above it where there is no room, in the picture."""
+    (x, y), (width, height) = foot.tolist(), size.tolist()
+    ha = "left" if x < width / 3 else "right" if x > 2 * width / 3 else "center"
+    x, room, top = float(np.clip(x, 0.0, width)), _LINE * height, float(outline[:, 1].min())
+    if y <= height - room:
+        return (x, max(y, 0.0)), ha, "top"
+    return (x, top if room <= top <= height else height), ha, "bottom"
 
 
 def _outlined() -> list[Any]:

@@ -75,6 +75,7 @@ def _check(inner) -> None:
         action="store_true",
         help="read OpenLane-V2's images as a whole, not only header and end: finds damage within a file, takes hours",
     )
+    check.add_argument("--all", action="store_true", help="list every fault and entry skipped, not the first 50")
 
 
 def _export(inner) -> None:

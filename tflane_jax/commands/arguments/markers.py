@@ -88,6 +88,7 @@ def _render(inner) -> None:
     render.add_argument("--ring", choices=("argoverse2", "nuscenes"), default="argoverse2", help="default argoverse2")
     render.add_argument("--cameras", type=int, default=3, help="first cameras of the ring (default 3)")
     render.add_argument("--scale", type=float, default=1.0, help="size of the images, 1 is native (default 1)")
+    render.add_argument("--surveyed", metavar="YYYY-MM-DD", help="day of the survey, for the store; default none")
     render.add_argument("--out", metavar="DIR", type=Path, required=True, help="folder to write")
 
 

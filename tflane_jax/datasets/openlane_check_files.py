@@ -1,0 +1,103 @@
+"""Which frames a folder of OpenLane-V2 names and has, the subset of each segment, and what does not belong there."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+from tflane_jax.datasets.base import SPLITS, Split
+from tflane_jax.datasets.openlane_frames import SUBSETS, SubsetName, frames_of, subset_of_frame
+from tflane_jax.datasets.openlane_sd_map import FILE
+from tflane_jax.errors import UserError
+from tflane_jax.files.fields import load_json
+from tflane_jax.files.openlane import FrameKey
+
+# Frames of a segment that are read to find its subset.
+_TRIED = 3
+_FRAME_FILE = re.compile(r"(\d+)(-ls)?\.json")
+_IMAGES = (".jpg", ".jpeg", ".png")
+_CAMERAS = {name for subset in SUBSETS.values() for name in subset.cameras}
+
+
+def named_frames(root: Path, faults: list[str]) -> dict[Split, list[FrameKey]]:
+    """Return the frames that any split file names."""
+    named: dict[Split, list[FrameKey]] = {split: [] for split in SPLITS}
+    for file in sorted(root.glob("data_dict_*.json")):
+        try:
+            content = load_json(file)
+            for split in SPLITS:
+                if isinstance(content, Mapping) and split not in content:
+                    continue
+                keys = frames_of(content, split, str(file))
+                faults += [
+                    f"{file}: {key} has no whole number as its timestamp"
+                    for key in keys
+                    if not key.timestamp.isdecimal()
+                ]
+                named[split] += [key for key in keys if key.timestamp.isdecimal()]
+        except UserError as error:
+            faults.append(str(error))
+    return named
+
+
+def frames_on_disk(root: Path, skipped: list[str]) -> dict[Split, list[FrameKey]]:
+    """Return the frames in the folders; files and folders that are none of the dataset's are skipped and named."""
+    found: dict[Split, list[FrameKey]] = {}
+    skipped += [
+        f"{path} is neither a split's folder ({', '.join(SPLITS)}) nor a split file nor a collection"
+        for path in root.glob("*")
+        if not _of_root(path)
+    ]
+    for split in SPLITS:
+        keys = set()
+        for segment in (root / split).glob("*"):
+            if not (segment / "info").is_dir():
+                skipped.append(f"{segment} is no segment: it has no info folder")
+                continue
+            skipped += [
+                f"{path} is no part of a segment (info, image, {FILE})"
+                for path in segment.glob("*")
+                if path.name not in ("info", "image", FILE)
+            ]
+            skipped += _strays_of_images(segment / "image")
+            for path in (segment / "info").glob("*"):
+                name = _FRAME_FILE.fullmatch(path.name)
+                if name is None or path.is_dir():
+                    skipped.append(f"{path} is no frame's file (<timestamp>.json or <timestamp>-ls.json)")
+                else:
+                    keys.add(FrameKey(split, segment.name, name[1]))
+        found[split] = sorted(keys, key=lambda key: (key.segment, int(key.timestamp)))
+    skipped.sort()
+    return found
+
+
+def _of_root(path: Path) -> bool:
+    if path.name in SPLITS:
+        return path.is_dir()
+    return path.is_file() and (path.match("data_dict_*.json") or path.suffix == ".pkl")
+
+
+def _strays_of_images(folder: Path) -> Iterator[str]:
+    for camera in folder.glob("*"):
+        if not camera.is_dir() or camera.name not in _CAMERAS:
+            yield f"{camera} is no folder of a camera of either subset"
+            continue
+        for path in camera.glob("*"):
+            if path.suffix.lower() not in _IMAGES or path.name.startswith("."):
+                yield f"{path} is no image ({', '.join(_IMAGES)})"
+
+
+def subsets_of(root: Path, on_disk: Mapping[Split, list[FrameKey]]) -> dict[tuple[str, str], SubsetName]:
+    """Return the subset of each (split, segment), by the cameras of its first readable frames; else that of others."""
+    found: dict[tuple[str, str], SubsetName | None] = {}
+    tried: Counter[tuple[str, str]] = Counter()
+    for key in (key for keys in on_disk.values() for key in keys):
+        segment = key.split, key.segment
+        if found.get(segment) is None and tried[segment] < _TRIED:
+            tried[segment] += 1
+            found[segment] = subset_of_frame(root, key)
+    known: list[SubsetName] = [subset for subset in found.values() if subset is not None]
+    other = known[0] if known else "A"
+    return {segment: other if subset is None else subset for segment, subset in found.items()}

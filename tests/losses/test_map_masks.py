@@ -147,6 +147,13 @@ def test_bins_of_depth(depth, expected):
     assert expected is None or published - 1 == expected
 
 
+def test_a_depth_just_below_the_last_border_is_in_the_last_bin():
+    """(62.2 - 1) / 0.9 is 68 bins, and rounds up to 68 in float32."""
+    bins, valid = depth_targets(with_depth(np.nextafter(np.float32(62.2), np.float32(0))), (4, 8), high=62.2, step=0.9)
+    assert np.asarray(valid).all()
+    assert (np.asarray(bins) == 67).all()
+
+
 def test_the_nearest_measured_surface_of_a_cell_counts():
     depth, valid = np.full((6, 4, 8), 20.0), np.ones((6, 4, 8), bool)
     depth[0, 0, 0], depth[0, 1, 1] = 3.0, 2.0

@@ -87,12 +87,19 @@ def test_queries_lie_on_the_lanes_of_their_cells_and_the_shape_head_sees_the_tru
     ((content, position, reference), state) = proposals(bev)
     assert content.shape == position.shape == (3, 8)
     assert reference.shape == (3, 5, 3)
-    assert np.asarray((reference >= 0) & (reference <= 1)).all()
+    assert np.asarray((reference >= 0.01) & (reference <= 0.99)).all()  # where a sigmoid has a slope
     assert not state
     clean, dirty = (proposals(bev, graph(((1, 3), (9, 3)), garbage=g), ["auxiliary"])[1] for g in (0.0, np.nan))
     for one, other in zip(jax.tree.leaves(clean), jax.tree.leaves(dirty), strict=True):
         np.testing.assert_array_equal(one, other)
     assert clean["auxiliary"]["lane_proposals"][0].lanes.shape == (4, 5, 3)
+
+
+def test_where_layers_look_at_one_point_it_is_the_middle_of_the_proposed_lane():
+    bev = jax.random.normal(jax.random.key(0), (*SHAPE, 6))
+    (lanes, points) = (proposals(bev, config=replace(DECODER, refine=refine))[0] for refine in ("iterative", "fixed"))
+    np.testing.assert_array_equal(points[2], np.repeat(lanes[2][:, 2:3], 5, axis=1))
+    np.testing.assert_array_equal(points[1], lanes[1])  # the position is of the whole lane
 
 
 def test_more_proposals_than_cells_and_bins_are_refused():
@@ -103,7 +110,9 @@ def test_more_proposals_than_cells_and_bins_are_refused():
 
 def test_an_untrained_shape_head_proposes_straight_lanes_along_the_bin():
     bev = jnp.zeros((*SHAPE, 6))
-    module = LaneProposals(DECODER, PerceptionRange((-100.0, 100.0), (-100.0, 100.0), (-1.0, 1.0)))
+    module = LaneProposals(
+        replace(DECODER, output="metric"), PerceptionRange((-100.0, 100.0), (-100.0, 100.0), (-1.0, 1.0))
+    )
     params = zero_params(lambda key: module.init(key, bev, None))
     _, _, reference = jax.jit(lambda p: module.apply(p, bev, None))(params)
     length = np.linalg.norm(np.asarray(200.0 * (reference[:, -1, :2] - reference[:, 0, :2])), axis=-1)

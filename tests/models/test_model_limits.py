@@ -34,6 +34,13 @@ def test_a_setting_that_does_not_fit_the_others_is_named(config, path, value, al
         changed(config, path, value).build()
 
 
+@pytest.mark.parametrize("config", [BASELINE, LIFTED_LINES])
+def test_only_lane_segments_need_a_multiple_of_eight_sampling_points(config):
+    changed(config, "decoder.sampling_points", 12).build()
+    with pytest.raises(SettingError, match=r"^decoder.sampling_points is 12: it must be a multiple of 8 or less"):
+        changed(SEGMENTS, "decoder.sampling_points", 12).build()
+
+
 def test_channels_of_the_lift_encode_positions():
     narrow = changed(LIFTED_LINES, "encoder.images.pyramid.dim", 18)
     with pytest.raises(SettingError, match=r"^encoder\.bev\.dim is 18: it must be a multiple of 4"):

@@ -17,6 +17,7 @@ from tflane_jax.layers.batch_norm import STATISTICS
 from tflane_jax.losses.lane_shape import LaneShapeLossConfig
 from tflane_jax.models.graph_encoders import GcnEncoderConfig, GtnEncoderConfig, HanEncoderConfig
 from tflane_jax.models.lstr import MEAN_BGR, STD_BGR, LaneShapeHeads, nearest, normalise, shrink
+from tflane_jax.tasks import lane_shape
 from tflane_jax.tasks.lane_shape import LaneShapeTask
 from tflane_jax.training.schedule import OptimConfig, make_optimizer
 from tflane_jax.training.state import init_state, state_of
@@ -219,6 +220,22 @@ def test_images_that_do_not_shrink_by_whole_blocks_are_named():
     LaneShapeTask(dataclasses.replace(tiny_model(), shrink=8)).check_settings(data)
     with pytest.raises(UserError, match=r"task\.model\.shrink is 7: it must be a divisor of 360 and 640"):
         LaneShapeTask(dataclasses.replace(tiny_model(), shrink=7)).check_settings(data)
+
+
+def test_the_validation_loss_does_not_depend_on_the_batch_size():
+    """Images with many and few lanes, and one without any, whose lanes a loss of a batch would weigh together."""
+    images = road_images(5)
+    valid = np.asarray(images.lines.valid).copy()
+    valid[1, 1:], valid[4] = False, False
+    images = images.replace(lines=images.lines.replace(valid=valid))
+    task, lines = tiny_task(), images.lines
+    answer = jax.vmap(task.predict, (None, 0))(fit("transformer").params, images)
+    together = lane_shape._losses(task, answer.curves, lines)
+    assert together.shape == (5,)
+    assert np.isfinite(together).all()
+    for i in range(5):
+        one = jax.tree.map(lambda leaf, i=i: leaf[i : i + 1], (answer.curves, lines))
+        np.testing.assert_allclose(lane_shape._losses(task, *one)[0], together[i], rtol=1e-5)
 
 
 def test_a_loss_of_one_image_is_refused():

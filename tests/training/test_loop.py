@@ -4,7 +4,6 @@ import dataclasses
 import json
 import os
 import re
-import shutil
 import signal
 import subprocess
 import sys
@@ -22,7 +21,6 @@ from tflane_jax.datasets.streaming import Streamed, StreamingConfig
 from tflane_jax.errors import UserError
 from tflane_jax.training import run_folder
 from tflane_jax.training.checkpoint import Checkpoints
-from tflane_jax.training.fine_tuning import check_origins
 from tflane_jax.training.loop import train
 from tflane_jax.training.records import read_records
 
@@ -181,58 +179,6 @@ def test_a_loss_that_is_not_finite_is_named_and_the_last_good_state_kept(whole, 
     short = dataclasses.replace(CONFIG, checkpoint_every=1, eval_every=1000, keep_checkpoints=40)
     run(tmp_path / "other", config=short)
     assert arrays(folder, kept) == arrays(tmp_path / "other", kept)
-
-
-def test_fine_tuning_starts_from_the_best_average(whole, tmp_path):
-    config = dataclasses.replace(CONFIG, steps=1, init_from=str(whole))
-    run(tmp_path / "run", config=config, optim=dataclasses.replace(OPTIM, lr=0.0, warmup_steps=0))
-    best = Checkpoints(whole / "checkpoints", best_metric="score")
-    start = Checkpoints(tmp_path / "run" / "checkpoints").params(1)["line"]["kernel"]
-    np.testing.assert_allclose(start, best.params(best.find("best"))["line"]["kernel"], rtol=1e-6)
-    with pytest.raises(UserError, match="holds another model"):
-        run(tmp_path / "other", config=dataclasses.replace(config, steps=9), task=LineTask(features=2))
-
-
-@pytest.mark.parametrize("content", ["{}", '{"training": {}}', '{"training": {"best_metric": "score", "seeds": 3}}'])
-def test_a_run_to_start_from_without_its_settings_is_damaged(whole, tmp_path, content):
-    shutil.copytree(whole, tmp_path / "origin")
-    (tmp_path / "origin" / "config.json").write_text(content)
-    with pytest.raises(UserError, match=r"config\.json is damaged: it lacks training\.best_metric or training\.seeds"):
-        check_origins(str(tmp_path / "origin"), (0,))
-
-
-def test_every_seed_may_start_from_a_run_of_its_own(whole, tmp_path):
-    short = dataclasses.replace(CONFIG, steps=4)
-    for seed in (0, 1):
-        run(tmp_path / f"host_{seed}", config=dataclasses.replace(short, seeds=(seed,)))
-    still = dataclasses.replace(OPTIM, lr=0.0, warmup_steps=0)
-    config = dataclasses.replace(CONFIG, steps=1, seeds=(0, 1), init_from=str(tmp_path / "host_{seed}"))
-    run(tmp_path / "run", config=config, optim=still)
-    tuned = Checkpoints(tmp_path / "run" / "checkpoints").params(1)["line"]["kernel"]
-    for i in (0, 1):
-        host = Checkpoints(tmp_path / f"host_{i}" / "checkpoints").params(4)["line"]["kernel"]
-        np.testing.assert_allclose(tuned[i], host, rtol=1e-6)
-    assert not np.array_equal(tuned[0], tuned[1])
-
-
-def test_parts_of_another_model_can_be_initialised_afresh(whole, tmp_path, capsys):
-    config = dataclasses.replace(CONFIG, steps=1, init_from=str(whole))
-    more = LineTask(second_layer=True)
-    still = dataclasses.replace(OPTIM, lr=0.0, warmup_steps=0)
-    with pytest.raises(UserError, match=r"second/.* is only here.*init_partly"):
-        run(tmp_path / "run", config=config, task=more, optim=still)
-    assert not (tmp_path / "run" / "config.json").exists()
-    partly = dataclasses.replace(config, init_partly=True)
-    run(tmp_path / "run", config=partly, task=more, optim=still)
-    assert "second start afresh" in capsys.readouterr().err
-    best = Checkpoints(whole / "checkpoints", best_metric="score")
-    start = Checkpoints(tmp_path / "run" / "checkpoints").params(1)
-    np.testing.assert_allclose(start["line"]["kernel"], best.params(best.find("best"))["line"]["kernel"], rtol=1e-6)
-    # The other direction: parameters that only the other run has are left out.
-    run(tmp_path / "back", config=dataclasses.replace(partly, init_from=str(tmp_path / "run")), optim=still)
-    assert "second are left out" in capsys.readouterr().err
-    with pytest.raises(UserError, match=r"another model \(line/"):
-        run(tmp_path / "other", config=partly, task=LineTask(features=2), optim=still)
 
 
 def test_a_run_that_cannot_begin_leaves_no_run_behind(tmp_path):

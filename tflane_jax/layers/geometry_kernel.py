@@ -98,7 +98,7 @@ def kernel_sum(
     """Return the weighted sum of the cells around a location, heads concatenated.
 
     A kernel cell's coordinates are those of the location, in cells, plus its integer offset, rounded to the nearest
-    even integer and clamped to the map. No gradient by the location.
+    integer (halves to the even one) and clamped to the map. No gradient by the location.
 
     Args:
         value: features of V maps.

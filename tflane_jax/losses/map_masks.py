@@ -99,7 +99,9 @@ def depth_targets(
     depth = jnp.where(views.depth_valid & (views.depth >= low), views.depth, jnp.inf)
     nearest = depth.reshape(-1, h, factor, w, factor).min((2, 4))
     valid = (nearest < high) & views.valid[:, None, None]
-    return jnp.where(valid, jnp.floor((nearest - low) / step), 0.0).astype(jnp.int32), valid
+    last = round((high - low) / step) - 1  # a depth just below `high` may be rounded up to the bin after it
+    number = jnp.minimum(jnp.floor((nearest - low) / step), last)
+    return jnp.where(valid, number, 0.0).astype(jnp.int32), valid
 
 
 def _points(lines: MapLines) -> tuple[Float[Array, "l s 3"], Bool[Array, " k"]]:

@@ -241,7 +241,7 @@ def refined_points(
         queries, bev: see `PointwiseRefinement`.
     """
     if config.refine == "iterative":
-        change = jnp.einsum("pk,qkc->qpc", smooth_basis(config.points), change)
+        change = jnp.einsum("pk,qkc->qpc", smooth_basis(config.points), change, precision="highest")
         change = change + PointwiseRefinement(config, range_, name="pointwise")(queries, reference, bev)
     if config.output == "sigmoid":
         return nn.sigmoid(change + inverse_sigmoid(reference))

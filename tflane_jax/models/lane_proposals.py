@@ -82,9 +82,14 @@ class LaneProposals(nn.Module):
             self.sow(AUXILIARY, "lane_proposals", LaneProposalOutputs(heat, propose(cell, heading)[1]))
         cell, heading, score = best_cells(lax.stop_gradient(heat), proposals.count)
         feature, points = propose(cell, heading)
-        reference = lax.stop_gradient(jnp.clip(self.range.normalise(points), 0.0, 1.0))
+        # Away from 0 and 1, where the sigmoid of the points is flat.
+        border = 0.01 if config.output == "sigmoid" else 0.0
+        reference = lax.stop_gradient(jnp.clip(self.range.normalise(points), border, 1.0 - border))
         content = nn.Dense(config.dim, name="content")(jnp.concatenate([feature, score[:, None]], -1))
         position = nn.Dense(config.dim, name="position")(reference.reshape(len(cell), -1))
+        if config.refine == "fixed":  # all layers look at one point
+            middle = config.points // 2
+            reference = jnp.broadcast_to(reference[:, middle : middle + 1], reference.shape)
         return content, position, reference
 
     def _centers(self, h: int, w: int) -> Float[np.ndarray, "q 2"]:

@@ -78,10 +78,8 @@ class LaneDecoderConfig:
     remat: bool = False
 
     def limits(self) -> Rules:
-        """Channels split over heads, sampling points over directions, and proposals are among the queries."""
+        """Channels split over heads, and proposals are among the queries."""
         yield splits("heads", self.heads, "dim", self.dim)
-        star = self.sampling_points % min(self.sampling_points, 8) == 0
-        yield "sampling_points", star, "a multiple of 8 or less than 8: they start as a star of eight directions"
         if self.proposals is not None:
             fits = self.proposals.count <= self.queries
             yield "proposals.count", fits, f"at most the decoder's queries ({self.queries})"

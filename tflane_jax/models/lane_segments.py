@@ -50,8 +50,10 @@ class SegmentDecoderConfig(LaneDecoderConfig):
     initial_score: Annotated[float, Limit("above 0 and below 1", lambda value: 0 < value < 1)] | None = None
 
     def limits(self) -> Rules:
-        """Those of every lane decoder, and an even number of heads."""
+        """Those of every lane decoder, sampling points that split over directions, and an even number of heads."""
         yield from super().limits()
+        star = self.sampling_points % min(self.sampling_points, 8) == 0
+        yield "sampling_points", star, "a multiple of 8 or less than 8: they start as a star of eight directions"
         yield "heads", self.heads % 2 == 0, "even: half of the attention heads look at each boundary"
 
 

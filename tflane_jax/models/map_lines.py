@@ -76,10 +76,8 @@ class LineDecoderConfig:
     remat: bool = False
 
     def limits(self) -> Rules:
-        """Channels split over heads, sampling points over directions."""
+        """Channels split over heads."""
         yield splits("heads", self.heads, "dim", self.dim)
-        star = self.sampling_points % min(self.sampling_points, 8) == 0
-        yield "sampling_points", star, "a multiple of 8 or less than 8: they start as a star of eight directions"
 
 
 PAPER_LINE_DECODER = LineDecoderConfig(dim=256, layers=6, queries=50, points=20, hidden=512, dropout=0.1)

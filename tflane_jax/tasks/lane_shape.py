@@ -165,14 +165,14 @@ class LaneShapeTask(Task[RoadImage, LabelledImages, ImageSource, None]):
     def evaluate(
         self, params: Params, data: LabelledImages, config: EvaluationConfig, frame_groups: Sequence[str] = ()
     ) -> Evaluation:
-        """Return TuSimple's metrics, and the loss of the last decoder layer as validation loss; without groups."""
+        """Return TuSimple's metrics, and the loss of the last decoder layer, its mean over images; without groups."""
         metrics, losses = TuSimpleMetrics(), []
         predicted = predicted_batches(
             self, params, data.images, config.batch_size, lambda b: b.replace(image=None), what=FOR_SCORES
         )
         for indices, batch, answer in predicted:
             lines = jax.tree.map(lambda leaf, i=indices: leaf[: len(i)], batch.lines)
-            losses += [float(_loss(self, answer.curves, lines))] * len(indices)
+            losses += np.asarray(_losses(self, answer.curves, lines)).tolist()
             for row, index in enumerate(indices):
                 truth, found = data.truth[index], jax.tree.map(lambda leaf, i=row: leaf[i], answer.curves)
                 metrics.update(found_lanes(found, truth), truth)
@@ -279,7 +279,9 @@ def frames_per_second(task: Predictor, params: Params) -> float:
 
 
 @partial(jax.jit, static_argnums=0)
-def _loss(task: LaneShapeTask, answer: CurvePrediction, lines: Any) -> jax.Array:
-    one_layer = jax.tree.map(lambda leaf: jnp.asarray(leaf)[:, None], answer)
+def _losses(task: LaneShapeTask, answer: CurvePrediction, lines: Any) -> Float[Array, " b"]:
+    """Return the loss of each image on its own: the loss of a batch weights its lanes by those of the other images."""
+    one_layer = jax.tree.map(lambda leaf: jnp.asarray(leaf)[:, None, None], answer)
     targets = lane_shape_targets(lines, shared_horizon=task.losses.shared_horizon)
-    return lane_shape_loss(one_layer, targets, task.losses)[0]
+    alone = jax.tree.map(lambda leaf: leaf[:, None], targets)
+    return jax.vmap(lambda curves, lanes: lane_shape_loss(curves, lanes, task.losses)[0])(one_layer, alone)

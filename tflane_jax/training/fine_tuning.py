@@ -24,7 +24,8 @@ def starting_params(
 ) -> list[Params]:
     """Return the parameters that each seed starts from: the averaged ones of a run's best checkpoint.
 
-    The last checkpoint counts as best if none was evaluated.
+    The last checkpoint counts as best if none was evaluated. Of a run with several seeds, each seed starts from itself,
+    and one that the run has not from the run's first.
 
     Args:
         reference: run folder; `{seed}` in it is replaced by the seed, so that each seed can have its own run.
@@ -38,8 +39,8 @@ def starting_params(
             a parameter of another shape, or without a frozen module.
     """
     return [
-        _params_of_run(folder, fresh.params, partly=partly, frozen=frozen)
-        for folder, fresh in zip(origin_folders(reference, seeds), states, strict=True)
+        _params_of_run(folder, fresh.params, seed, partly=partly, frozen=frozen)
+        for folder, fresh, seed in zip(origin_folders(reference, seeds), states, seeds, strict=True)
     ]
 
 
@@ -56,11 +57,12 @@ def check_origins(reference: str, seeds: Sequence[int]) -> None:
 
 
 def origins(reference: str, seeds: Sequence[int]) -> list[dict[str, Any]]:
-    """Return folder, step and content of the checkpoint that each seed starts from, see `starting_params`."""
+    """Return folder, step, seed and content of the checkpoint that each seed starts from, see `starting_params`."""
     found = []
-    for folder in origin_folders(reference, seeds):
-        checkpoints, step, _ = _starting_checkpoint(folder)
-        found.append({"run": str(folder), "step": step, "content": checkpoints.content(step)})
+    for folder, seed in zip(origin_folders(reference, seeds), seeds, strict=True):
+        checkpoints, step, theirs = _starting_checkpoint(folder)
+        place = {"run": str(folder), "step": step, "seed": theirs[_place(seed, theirs)]}
+        found.append(place | {"content": checkpoints.content(step)})
     return found
 
 
@@ -80,10 +82,15 @@ def _starting_checkpoint(folder: Path) -> tuple[Checkpoints, int, list[int]]:
     return checkpoints, checkpoints.find("last") if step is None else step, seeds
 
 
-def _params_of_run(folder: Path, fresh: Params, *, partly: bool, frozen: Sequence[str]) -> Params:
+def _place(seed: int, of_run: Sequence[int]) -> int:
+    """Return which of a run's seeds a seed starts from."""
+    return of_run.index(seed) if seed in of_run else 0
+
+
+def _params_of_run(folder: Path, fresh: Params, seed: int, *, partly: bool, frozen: Sequence[str]) -> Params:
     checkpoints, step, seeds = _starting_checkpoint(folder)
-    params = checkpoints.params(step)
-    saved, wanted = (flat(tree) for tree in (per_seed(params, seeds)[0], fresh))
+    params = per_seed(checkpoints.params(step), seeds)[_place(seed, seeds)]
+    saved, wanted = (flat(tree) for tree in (params, fresh))
     for name in sorted(saved.keys() & wanted.keys()):
         if _shape(saved[name]) != _shape(wanted[name]):
             raise UserError(

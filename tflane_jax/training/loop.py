@@ -71,8 +71,8 @@ class TrainingConfig:
         checkpoint_every: steps between further checkpoints.
         keep_checkpoints: how many of the latest to keep, beside the best.
         best_metric: score of the evaluation that chooses the best checkpoint; higher is better.
-        init_from: folder of a run whose best averaged parameters to start from (fine-tuning); `{seed}` in it is
-            replaced by the seed. None starts from random parameters.
+        init_from: folder of a run whose best averaged parameters to start from (fine-tuning), each seed from itself if
+            the run has it; `{seed}` in it is replaced by the seed. None starts from random parameters.
         init_partly: whether that run's model may have other modules; those that it lacks start from random parameters.
     """
 

@@ -12,6 +12,7 @@ from tflane_jax.config import load_config
 from tflane_jax.config_files import split_reference
 from tflane_jax.config_overrides import apply_overrides
 from tflane_jax.errors import UserError
+from tflane_jax.files.atomic import check_folder
 from tflane_jax.training.runtime import configure_jax
 
 
@@ -27,6 +28,7 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> int:
         raise UserError(f"--seeds {' '.join(map(str, options.seeds))}: the seeds must differ")
     if options.jobs < 1:
         raise UserError(f"--jobs {options.jobs}: at least one training runs at a time")
+    check_folder(options.out)
     configure_jax()
     configs = {
         name: apply_overrides(load_config(reference), [*overrides, *settings])

@@ -130,6 +130,9 @@ def test_damaged_files_of_a_run_are_named(run, file, content):
         (lambda c: c.pop("class"), "should be a RunConfig"),
         (lambda c: c["optim"].update(lr="fast"), "optim.lr cannot be 'fast'"),
         (lambda c: c["optim"].update(lr=-1.0), "optim.lr is -1.0: it must be"),
+        (lambda c: c["optim"].update(lr=10**400), "optim.lr cannot be 1000"),
+        (lambda c: c["task"].update({"class": ["LaneGraphTask"]}), "task cannot be {'class': ['LaneGraphTask']"),
+        (lambda c: c["training"].update(seeds=[2**32]), "training.seeds is (4294967296,)"),
         (lambda c: c["optim"].update(lr=None), "optim.lr cannot be None"),
         (lambda c: c["optim"].update(restarts=[1]), "optim.restarts cannot be"),
         (lambda c: c["optim"].update(lrr=1.0), "optim.lrr is unknown"),
@@ -162,13 +165,27 @@ def test_wrong_entries_of_a_manifest_are_named(run, entry, value):
         open_run(run)
 
 
+def test_a_score_that_no_number_can_hold_is_named(run):
+    path = run / MANIFEST
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"metrics": {"all/DET_l": 10**400}}))
+    with pytest.raises(UserError, match="metrics is not what was written"):
+        open_run(run)
+
+
 @pytest.mark.parametrize(
     "change",
-    [{"window": None}, {"window": {"steps": 1}}, {"seconds": "long"}, {"metrics": []}, {"cycles": [{"x": 1}]}],
+    [
+        {"window": None},
+        {"window": {"steps": 1}},
+        {"seconds": "long"},
+        {"seconds": 10**400},
+        {"metrics": []},
+        {"cycles": [{"x": 1}]},
+    ],
 )
 def test_wrong_progress_is_an_error_that_the_loop_names(change):
     assert _carried(PROGRESS, [])[2] == 1.0
-    with pytest.raises((KeyError, TypeError, ValueError, AttributeError)):
+    with pytest.raises((KeyError, TypeError, ValueError, AttributeError, OverflowError)):
         _carried(PROGRESS | change, [])
 
 

@@ -300,12 +300,13 @@ def _wrong_entry(manifest: Manifest) -> str | None:
         "version": type(manifest.version) is int,
         "config": isinstance(manifest.config, dict),
         "progress": isinstance(manifest.progress, dict),
-        **{
-            name: isinstance(entry, dict) and all(type(value) in (int, float) for value in entry.values())
-            for name, entry in numbers.items()
-        },
+        **{name: isinstance(entry, dict) and all(map(_is_number, entry.values())) for name, entry in numbers.items()},
     }
     return next((name for name, fits in right.items() if not fits), None)
+
+
+def _is_number(value: Any) -> bool:
+    return type(value) is float or (type(value) is int and abs(value) < 2**63)
 
 
 def _checksums(folder: Path) -> dict[str, int]:

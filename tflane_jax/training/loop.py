@@ -20,7 +20,7 @@ from tflane_jax.datasets.batches import Prepare, batches, first_example
 from tflane_jax.devices import divided, of_one_process, share, training_mesh
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import write_json, write_text
-from tflane_jax.limits import DIFFERENT, NOT_EMPTY, Count, CountOrZero, Rules, check_settings, splits
+from tflane_jax.limits import DIFFERENT, NOT_EMPTY, Count, Rules, Seed, check_settings, splits
 from tflane_jax.models.parameters import Params
 from tflane_jax.processes import AgreedError, agreed, apart, arrays_from_first, count, from_first, is_first, stop_signal
 from tflane_jax.progress import progress_bar
@@ -76,7 +76,7 @@ class TrainingConfig:
     same_examples: bool = False
     accumulate: Count = 1
     shard_state: bool = False
-    seeds: Annotated[tuple[CountOrZero, ...], NOT_EMPTY, DIFFERENT] = (0,)
+    seeds: Annotated[tuple[Seed, ...], NOT_EMPTY, DIFFERENT] = (0,)
     log_every: Count = 50
     eval_every: Count = 1000
     checkpoint_every: Count = 500
@@ -190,7 +190,7 @@ def train(
             states = per_seed(restored, config.seeds)
             try:
                 window, metrics, times.seconds, memories = _carried(latest["progress"], memories)
-            except (KeyError, TypeError, ValueError, AttributeError) as error:
+            except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
                 raise checkpoints.damaged_progress(latest["step"], error) from error
         elif (origin := config.init_from) is not None:
             fresh = states

@@ -2,6 +2,9 @@
 
 import contextlib
 import errno
+import os
+import subprocess
+import sys
 
 import jax
 import pytest
@@ -28,6 +31,15 @@ def test_a_folder_that_may_not_be_read_is_one_line(monkeypatch, capsys):
     assert main(["cache", "list"]) == 2
     said = capsys.readouterr().err
     assert said == "tflane: /private/runs: Permission denied: give yourself the right, or choose another path\n"
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no /dev/full")
+def test_a_full_output_is_one_line():
+    with open("/dev/full", "w") as full:
+        command = [sys.executable, "-m", "tflane_jax.cli", "cache", "list"]
+        ended = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+    said = "tflane: cannot print: No space left on device; make room or print elsewhere\n"
+    assert (ended.returncode, ended.stderr) == (2, said)
 
 
 @pytest.mark.parametrize("full", [True, False])

@@ -201,10 +201,15 @@ def test_a_damaged_run_ends_the_command_with_a_message(run, capsys):
 @pytest.mark.parametrize(
     "line", ["", "x", "[]", "3", "{}", '{"step": "1", "split": "train"}', '{"step": 1, "split": "val", "loss": "low"}']
 )
-def test_records_end_at_the_first_line_that_is_none(run, line):
+def test_only_a_last_line_may_be_no_record(run, line):
     path = run / "metrics.jsonl"
-    path.write_text(f"{path.read_text()}{line}\n" + '{"step": 2, "split": "train", "loss": 1.0}\n')
+    path.write_text(f"{path.read_text()}{line}\n")
     assert [record["step"] for record in read_records(path)] == [1]
+    content = path.read_text() + '{"step": 2, "split": "train", "loss": 1.0}\n'
+    path.write_text(content)
+    with pytest.raises(UserError, match=r"metrics\.jsonl, line 2 is no record: correct or delete"):
+        RecordWriter(run, 2)
+    assert path.read_text() == content
 
 
 @pytest.mark.parametrize("file", ["_file", "_board"])

@@ -40,6 +40,8 @@ def run(options: argparse.Namespace) -> int:
     if not chosen and options.record is not None:
         if not options.record.is_dir():
             raise UserError(f"--record {options.record} is no folder of results, such as docs/results")
+        if not any(options.record.glob("*.json")):
+            raise UserError(f"--record {options.record} holds no results of tables (NAME.json): name docs/results")
         print("written:", record([], options.record))
         return 0
     if not chosen:

@@ -42,6 +42,24 @@ def test_a_full_output_is_one_line():
     assert (ended.returncode, ended.stderr) == (2, said)
 
 
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("compare tf_lane/toponet gtn_lane/lstr --seeds 1 4294967296", "--seeds 4294967296: a seed is a whole number"),
+        ("cache list --import ends.py", "module ends.py (--import or TFLANE_IMPORT) cannot be imported: SystemExit: 3"),
+    ],
+)
+def test_other_mistakes_are_one_line(arguments, message, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    for name in ("TFLANE_IMPORT", "TFLANE_FILES"):
+        monkeypatch.setenv(name, "")
+    (tmp_path / "ends.py").write_text("import sys\n\nsys.exit(3)\n")
+    assert main(arguments.split()) == 2
+    said = capsys.readouterr().err
+    assert said.startswith(f"tflane: {message}")
+    assert said.count("\n") == 1
+
+
 @pytest.mark.parametrize("full", [True, False])
 def test_a_device_whose_memory_is_full_is_one_line(full, monkeypatch, capsys):
     text = "RESOURCE_EXHAUSTED: Out of memory" if full else "INTERNAL: no such program"

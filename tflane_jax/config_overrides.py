@@ -145,15 +145,14 @@ def _checked_names(config: RunConfig, arguments: Sequence[str]) -> set[str]:
             continue
         setting = name if name in known else name.replace(".no_", ".")  # of a flag: --a.no-b
         if setting not in known:
-            turned = re.sub(r"^no_(.*\.|)", r"\1no_", name)  # --no-a.b for --a.no-b
+            turned = re.sub(r"^no_(.*\.|)", r"\1no_", name).replace("_", "-")  # --no-a.b for --a.no-b
             close = [turned] if name.removeprefix("no_") in known else _closest(name, known)
             hint = f"did you mean {' or '.join(f'--{c}' for c in close)}?" if close else "see --help for all settings"
             raise UserError(f"unknown setting --{name}: {hint}")
         if isinstance(values[setting], bool) and ("=" in argument or not following.startswith("--")):
-            part, dot, last = setting.rpartition(".")
-            raise UserError(
-                f"--{setting} is a flag without a value: write it alone, or --{part}{dot}no_{last} for False"
-            )
+            part, dot, last = setting.replace("_", "-").rpartition(".")
+            flag, off = f"--{part}{dot}{last}", f"--{part}{dot}no-{last}"
+            raise UserError(f"{flag} is a flag without a value: write it alone, or {off} for False")
         found.add(setting)
     return found
 

@@ -24,7 +24,7 @@ from tflane_jax.runs import open_run, resumable_config
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.training import array_files, checkpoint, provenance, run_folder
 from tflane_jax.training.checkpoint import Checkpoints, Manifest
-from tflane_jax.training.loop import _carried
+from tflane_jax.training.loop import WRONG_PROGRESS, _carried
 from tflane_jax.training.records import RecordWriter, read_records
 from tflane_jax.training.schedule import OptimConfig, make_optimizer
 from tflane_jax.training.state import init_states
@@ -185,7 +185,7 @@ def test_a_score_that_no_number_can_hold_is_named(run):
 )
 def test_wrong_progress_is_an_error_that_the_loop_names(change):
     assert _carried(PROGRESS, [])[2] == 1.0
-    with pytest.raises((KeyError, TypeError, ValueError, AttributeError, OverflowError)):
+    with pytest.raises(WRONG_PROGRESS):
         _carried(PROGRESS | change, [])
 
 

@@ -45,6 +45,9 @@ Evaluate = Callable[[Params], dict[str, float]]
 Draw = Callable[[Path, int, Params, list[Record]], None]
 """(run folder, step, averaged parameters of the first seed, all records) -> pictures in the run folder."""
 
+WRONG_PROGRESS = (KeyError, TypeError, ValueError, AttributeError, OverflowError)
+"""What a checkpoint's entry "progress" raises that is not what was written."""
+
 
 @dataclass(frozen=True)
 class TrainingConfig:
@@ -190,7 +193,7 @@ def train(
             states = per_seed(restored, config.seeds)
             try:
                 window, metrics, times.seconds, memories = _carried(latest["progress"], memories)
-            except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
+            except WRONG_PROGRESS as error:
                 raise checkpoints.damaged_progress(latest["step"], error) from error
         elif (origin := config.init_from) is not None:
             fresh = states

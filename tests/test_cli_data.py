@@ -73,6 +73,33 @@ def test_where_a_table_cannot_be_written_is_told_before_the_work(arguments, out,
     assert capsys.readouterr().err.startswith("tflane: cannot write ")
 
 
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        "export RUN --out FOLDER",
+        "data show --data street --out FOLDER",
+        "data maps RUN --out FOLDER",
+        "sweep RUN --setting data.world.severity --values 0 --out FILE",
+        "tables tf_lane.1 --out FILE",
+        "tables gtn_lane.1 --search --out FILE/below",
+        "carry-over RUN --out FILE",
+        "compare tf_lane/toponet tf_lane/toponet_tfm --out FILE",
+        "train --config tf_lane/toponet --out FILE",
+        "train --config tf_lane/toponet --out \udcff",
+    ],
+)
+def test_an_output_that_cannot_be_written_is_told_before_the_work(arguments, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("tflane_jax.datasets.sources.make_dataset", None)
+    (tmp_path / "FOLDER").mkdir()
+    (tmp_path / "FILE").touch()
+    assert main(arguments.split()) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("tflane: cannot write ")
+    assert said.endswith("; choose another path\n")
+    assert {path.name for path in tmp_path.iterdir()} == {"FOLDER", "FILE"}
+
+
 @pytest.mark.parametrize("command", ["eval RUN", "summary", "data overlap A B", "data stats", "score maptr A B"])
 @pytest.mark.parametrize("out", ["x.json", "x.md", "x.JSON", "x"])
 def test_a_table_may_be_named_with_its_suffix(command, out):

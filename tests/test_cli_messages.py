@@ -2,6 +2,9 @@
 
 import contextlib
 import errno
+import os
+import subprocess
+import sys
 
 import jax
 import pytest
@@ -28,6 +31,33 @@ def test_a_folder_that_may_not_be_read_is_one_line(monkeypatch, capsys):
     assert main(["cache", "list"]) == 2
     said = capsys.readouterr().err
     assert said == "tflane: /private/runs: Permission denied: give yourself the right, or choose another path\n"
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no /dev/full")
+def test_a_full_output_is_one_line():
+    with open("/dev/full", "w") as full:
+        command = [sys.executable, "-m", "tflane_jax.cli", "cache", "list"]
+        ended = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+    said = "tflane: cannot print: No space left on device; make room or print elsewhere\n"
+    assert (ended.returncode, ended.stderr) == (2, said)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("compare tf_lane/toponet gtn_lane/lstr --seeds 1 4294967296", "--seeds 4294967296: a seed is a whole number"),
+        ("cache list --import ends.py", "module ends.py (--import or TFLANE_IMPORT) cannot be imported: SystemExit: 3"),
+    ],
+)
+def test_other_mistakes_are_one_line(arguments, message, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    for name in ("TFLANE_IMPORT", "TFLANE_FILES"):
+        monkeypatch.setenv(name, "")
+    (tmp_path / "ends.py").write_text("import sys\n\nsys.exit(3)\n")
+    assert main(arguments.split()) == 2
+    said = capsys.readouterr().err
+    assert said.startswith(f"tflane: {message}")
+    assert said.count("\n") == 1
 
 
 @pytest.mark.parametrize("full", [True, False])

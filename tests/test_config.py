@@ -205,6 +205,13 @@ def test_settings_that_a_file_lacks_take_their_defaults():
     assert from_json(Outer, {"class": "Outer", "rate": 2.0}) == Outer(rate=2.0)
 
 
+LOAD = "from tflane_jax.config import load_config\n"
+STEPS = (
+    "from tflane_jax.config import RunConfig, TrainingConfig\ndef get_config():\n"
+    "    return RunConfig(training=TrainingConfig(steps="
+)
+
+
 @pytest.mark.parametrize(
     ("content", "message"),
     [
@@ -212,6 +219,13 @@ def test_settings_that_a_file_lacks_take_their_defaults():
         ("def get_config():\n    return 3", "gave a int, not a RunConfig"),
         ("def get_config():\n    y = 1\n    return y / 0", "line 3: ZeroDivisionError"),
         ("import no_such_module", "line 1: ModuleNotFoundError"),
+        ("import sys\nsys.exit(3)", "line 2: SystemExit: 3"),
+        ("import sys\ndef get_config():\n    sys.exit('no GPU')", "line 3: SystemExit: no GPU"),
+        (
+            f"{LOAD}def get_config():\n    return load_config(__file__)",
+            r"py, line 3: UserError: config file \S*broken\.py loads itself$",
+        ),
+        (f"{STEPS}10**5000))", r"line 3: training\.steps is a value that cannot be shown"),
         ("def get_config(:", "line 1: SyntaxError"),
     ],
 )
@@ -276,7 +290,7 @@ def test_a_file_takes_precedence_over_a_shipped_name(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("own.py").write_text("from tflane_jax.config import RunConfig\n\nget_config = RunConfig\n")
     assert load_config("own.py") == RunConfig()
-    with pytest.raises(UserError, match="config file own does not exist"):
+    with pytest.raises(UserError, match=r"config file own does not exist: did you mean own\.py\?"):
         load_config("own")
 
 
@@ -302,6 +316,14 @@ def test_unknown_references_suggest_similar_names(reference, message, tmp_path, 
 def test_missing_config_files_are_errors(tmp_path):
     with pytest.raises(UserError, match="does not exist"):
         load_config(str(tmp_path / "nothing.py"))
+    (tmp_path / "link").symlink_to(tmp_path / "nothing.py")
+    for name, message in (
+        (tmp_path, "is a folder"),
+        (tmp_path / "link", "a link that leads nowhere"),
+        ("", "is empty"),
+    ):
+        with pytest.raises(UserError, match=message):
+            load_config(str(name))
     (tmp_path / "config.txt").touch()
     with pytest.raises(UserError, match="no Python file"):
         load_config(str(tmp_path / "config.txt"))

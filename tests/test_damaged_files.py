@@ -24,7 +24,7 @@ from tflane_jax.runs import open_run, resumable_config
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.training import array_files, checkpoint, provenance, run_folder
 from tflane_jax.training.checkpoint import Checkpoints, Manifest
-from tflane_jax.training.loop import _carried
+from tflane_jax.training.loop import WRONG_PROGRESS, _carried
 from tflane_jax.training.records import RecordWriter, read_records
 from tflane_jax.training.schedule import OptimConfig, make_optimizer
 from tflane_jax.training.state import init_states
@@ -130,6 +130,9 @@ def test_damaged_files_of_a_run_are_named(run, file, content):
         (lambda c: c.pop("class"), "should be a RunConfig"),
         (lambda c: c["optim"].update(lr="fast"), "optim.lr cannot be 'fast'"),
         (lambda c: c["optim"].update(lr=-1.0), "optim.lr is -1.0: it must be"),
+        (lambda c: c["optim"].update(lr=10**400), "optim.lr cannot be 1000"),
+        (lambda c: c["task"].update({"class": ["LaneGraphTask"]}), "task cannot be {'class': ['LaneGraphTask']"),
+        (lambda c: c["training"].update(seeds=[2**32]), "training.seeds is (4294967296,)"),
         (lambda c: c["optim"].update(lr=None), "optim.lr cannot be None"),
         (lambda c: c["optim"].update(restarts=[1]), "optim.restarts cannot be"),
         (lambda c: c["optim"].update(lrr=1.0), "optim.lrr is unknown"),
@@ -162,13 +165,27 @@ def test_wrong_entries_of_a_manifest_are_named(run, entry, value):
         open_run(run)
 
 
+def test_a_score_that_no_number_can_hold_is_named(run):
+    path = run / MANIFEST
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"metrics": {"all/DET_l": 10**400}}))
+    with pytest.raises(UserError, match="metrics is not what was written"):
+        open_run(run)
+
+
 @pytest.mark.parametrize(
     "change",
-    [{"window": None}, {"window": {"steps": 1}}, {"seconds": "long"}, {"metrics": []}, {"cycles": [{"x": 1}]}],
+    [
+        {"window": None},
+        {"window": {"steps": 1}},
+        {"seconds": "long"},
+        {"seconds": 10**400},
+        {"metrics": []},
+        {"cycles": [{"x": 1}]},
+    ],
 )
 def test_wrong_progress_is_an_error_that_the_loop_names(change):
     assert _carried(PROGRESS, [])[2] == 1.0
-    with pytest.raises((KeyError, TypeError, ValueError, AttributeError)):
+    with pytest.raises(WRONG_PROGRESS):
         _carried(PROGRESS | change, [])
 
 
@@ -184,10 +201,15 @@ def test_a_damaged_run_ends_the_command_with_a_message(run, capsys):
 @pytest.mark.parametrize(
     "line", ["", "x", "[]", "3", "{}", '{"step": "1", "split": "train"}', '{"step": 1, "split": "val", "loss": "low"}']
 )
-def test_records_end_at_the_first_line_that_is_none(run, line):
+def test_only_a_last_line_may_be_no_record(run, line):
     path = run / "metrics.jsonl"
-    path.write_text(f"{path.read_text()}{line}\n" + '{"step": 2, "split": "train", "loss": 1.0}\n')
+    path.write_text(f"{path.read_text()}{line}\n")
     assert [record["step"] for record in read_records(path)] == [1]
+    content = path.read_text() + '{"step": 2, "split": "train", "loss": 1.0}\n'
+    path.write_text(content)
+    with pytest.raises(UserError, match=r"metrics\.jsonl, line 2 is no record: correct or delete"):
+        RecordWriter(run, 2)
+    assert path.read_text() == content
 
 
 @pytest.mark.parametrize("file", ["_file", "_board"])

@@ -23,6 +23,7 @@ from tflane_jax.limits import (
     PositiveOrInfinite,
     Range,
     Rules,
+    Seed,
     SettingError,
     above,
     check_settings,
@@ -60,6 +61,7 @@ class Outer:
     range: Range = (0.0, 0.0)
     count: Count = 1
     rest: CountOrZero = 0
+    seed: Seed = 2**32 - 1
     lr: Positive = 1.0
     clip: PositiveOrInfinite | None = math.inf
     fraction: Fraction = 1.0
@@ -103,9 +105,14 @@ def test_the_defaults_fit():
         ("range", (-1.0, 1.0), "a finite number of at least 0"),
         ("count", 0, "a whole number of at least 1"),
         ("count", 1.0, "a whole number of at least 1"),
+        ("count", 2**31, "at most 2147483647"),
+        pytest.param("count", 10**5000, "a whole number of at least 1", id="digits"),
+        ("seed", 2**32, "a whole number of at least 0 and at most 4294967295"),
+        ("plain", 10**400, "a finite number"),
         ("rest", -1, "a whole number of at least 0"),
         ("lr", 0.0, "a finite number above 0"),
         ("lr", math.inf, "a finite number above 0"),
+        ("clip", 10**400, "a number above 0, or inf or None"),
         ("clip", -1.0, "a number above 0, or inf or None"),
         ("clip", math.nan, "a number above 0, or inf or None"),
         ("fraction", 1.5, "a finite number from 0 to 1"),
@@ -126,7 +133,10 @@ def test_what_does_not_fit_is_named_with_what_does(name, value, allowed):
     ("config", "message"),
     [
         (Outer(inner=Inner(heads=3)), r"^inner\.heads is 3: it must be a divisor of dim \(8\)$"),
-        (Outer(inner=Inner(heads=0)), r"^inner\.heads is 0: it must be a whole number of at least 1$"),
+        (
+            Outer(inner=Inner(heads=0)),
+            r"^inner\.heads is 0: it must be a whole number of at least 1 and at most 2147483647$",
+        ),
         (Outer(parts=(Inner(), Inner(dim=-4))), r"^parts\[1\]\.dim is -4"),
         (Outer(parts=(Inner(), Inner(heads=5))), r"^parts\[1\]\.heads is 5: it must be a divisor"),
         (Outer(inner=Inner(dim=800)), r"^inner\.dim is 800: it must be less than 100 counts$"),

@@ -27,6 +27,7 @@ from tflane_jax.own_modules import add_imports, import_own, look_in, take_import
 from tflane_jax.startup import leave
 
 _AGAIN_SECONDS = 0.1
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -56,7 +57,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _run_command(options: argparse.Namespace, rest: Sequence[str]) -> int:
     try:
         command = getattr(importlib.import_module(f"tflane_jax.commands.{options.module}"), options.function)
-        return (command(options, rest) if options.takes_overrides else command(options)) or 0
+        code = (command(options, rest) if options.takes_overrides else command(options)) or 0
+        sys.stdout.flush()  # here, where its errors are told
+        return code
     except UserError as error:
         print(f"tflane: {error}", file=sys.stderr)
         return 2
@@ -64,7 +67,7 @@ def _run_command(options: argparse.Namespace, rest: Sequence[str]) -> int:
         print("tflane: stopped", file=sys.stderr)
         return 128 + getattr(error, "number", signal.SIGINT)
     except BrokenPipeError:  # `tflane ... | head`
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _drop_output()
         return 128 + signal.SIGPIPE
     except RuntimeError as error:
         # By name, because importing JAX is slow. Other libraries say the same of a full disk.
@@ -74,12 +77,21 @@ def _run_command(options: argparse.Namespace, rest: Sequence[str]) -> int:
         print(f"tflane: the memory of the device is full: {remedies} (docs/scale.md)", file=sys.stderr)
         return 2
     except OSError as error:
+        if error.filename is None and error.errno in _FULL:
+            print(f"tflane: cannot print: {error.strerror}; make room or print elsewhere", file=sys.stderr)
+            _drop_output()
+            return 2
         # pathlib raises these wherever it looks for such a file
         if error.filename is None or error.errno not in (errno.ENAMETOOLONG, errno.EACCES, errno.EPERM):
             raise
         remedy = "" if error.errno == errno.ENAMETOOLONG else ": give yourself the right, or choose another path"
         print(f"tflane: {error.filename}: {error.strerror}{remedy}", file=sys.stderr)
         return 2
+
+
+def _drop_output() -> None:
+    """Print nothing more: what is left would fail again when the process ends."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 class OneLineWarnings:

@@ -53,6 +53,7 @@ else:
 
 T = TypeVar("T")
 _STEP_COUNTS = ("steps", "eval_every", "checkpoint_every")  # of `TrainingConfig`
+_RUNNING = set[tuple[Path, str]]()  # functions of configuration files, with their files
 # Configuration files import data classes from here or from their dataset's file.
 __all__ = [
     "EvaluationConfig",
@@ -240,8 +241,14 @@ def _run_function(path: Path, function: str, kind: type[T]) -> T:
         module = import_file(path, beside=not is_shipped(path))
     if not hasattr(module, function):
         raise UserError(f"config file {path} has no function {function}()")
-    with _named_errors(path):
-        value = getattr(module, function)()
+    if (running := (path.resolve(), function)) in _RUNNING:
+        raise UserError(f"config file {path} loads itself")
+    _RUNNING.add(running)
+    try:
+        with _named_errors(path):
+            value = getattr(module, function)()
+    finally:
+        _RUNNING.remove(running)
     if not isinstance(value, kind):
         raise UserError(f"{function}() in config file {path} gave a {type(value).__name__}, not a {kind.__name__}")
     return value
@@ -251,7 +258,7 @@ def _run_function(path: Path, function: str, kind: type[T]) -> T:
 def _named_errors(path: Path):
     try:
         yield
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         own = str(path.resolve())  # as `import_file` does
         lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == own]
         line = error.lineno if isinstance(error, SyntaxError) else lines[-1] if lines else "?"
@@ -279,7 +286,7 @@ def _lines_of(path: Path, error: SettingError) -> str:
     """Return the lines of a file that set a setting, in words for an error; "" if none can be identified."""
     name = re.sub(r"\[\d+\]$", "", error.setting).rpartition(".")[2]
     given = [k for k in ast.walk(ast.parse(path.read_text("utf-8"))) if isinstance(k, ast.keyword) and k.arg == name]
-    written = [k for k in given if ast.unparse(k.value) == repr(error.value)] or given
+    written = [k for k in given if ast.unparse(k.value) == error.shown] or given
     return f", line {' or '.join(str(k.lineno) for k in written)}" if written else ""
 
 

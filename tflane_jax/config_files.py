@@ -6,6 +6,7 @@ A checkout keeps the shipped configurations in `configs/` beside the package, a 
 from __future__ import annotations
 
 import difflib
+import os
 from pathlib import Path
 
 import tflane_jax
@@ -46,15 +47,23 @@ def find_config(name: str) -> Path:
     Raises:
         UserError: neither exists; the message lists the shipped names closest to it.
     """
-    if Path(name).is_file():
-        return Path(name)
+    if not name:
+        raise UserError("the name of the config file is empty: name a Python file or a shipped configuration")
+    path = Path(name)
+    if path.is_file():
+        return path
     shipped = shipped_configs()
     if name in shipped:
         return shipped[name]
+    if os.path.lexists(path):
+        kind = "a folder" if path.is_dir() else "no regular file" if path.exists() else "a link that leads nowhere"
+        raise UserError(f"config file {name} is {kind}: name a Python file (.py)")
     raise UserError(f"config file {name} does not exist: {_hint(name, shipped)}")
 
 
 def _hint(name: str, shipped: dict[str, Path]) -> str:
+    if Path(f"{name}.py").is_file():
+        return f"did you mean {name}.py?"
     wanted = name.removesuffix(".py").rpartition("configs/")[2]
     if wanted in shipped:
         return f"the shipped configuration is called {wanted}"

@@ -219,7 +219,7 @@ def _value(hint: Any, content: Any, path: str) -> Any:
         if content in hint.__members__:
             return hint[content]
         raise UserError(f"setting {path} cannot be {content!r:.80}")
-    if hint is float and type(content) is int:
+    if hint is float and type(content) is int and abs(content) <= sys.float_info.max:
         return float(content)
     if isinstance(hint, type) and type(content) is hint:
         return content
@@ -261,7 +261,7 @@ def _member(kinds: tuple[Any, ...], content: Any, path: str) -> Any:
     """Read the first member of a union that fits: None, the class with the saved name, or a plain type."""
     if content is None and type(None) in kinds:
         return None
-    if isinstance(content, dict):
+    if isinstance(content, dict) and isinstance(content.get("class"), str):
         for kind in kinds:
             known = subclasses(kind) if _is_open(kind) else {getattr(kind, "__name__", ""): kind}
             if dataclasses.is_dataclass(kind) and content.get("class") in known:

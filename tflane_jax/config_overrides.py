@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import difflib
 import io
+import itertools
 import re
 import typing
 from collections.abc import Iterable, Sequence
@@ -137,15 +138,21 @@ def _setting(argument: str) -> str:
 
 def _checked_names(config: RunConfig, arguments: Sequence[str]) -> set[str]:
     """Return the settings that arguments change; raise UserError for one that there is not."""
-    known, found = override_names(config), set()
-    for argument in arguments:
+    values = {name: value for name, value in settings(config) if not dataclasses.is_dataclass(value)}
+    known, found = list(values), set()
+    for argument, following in itertools.zip_longest(arguments, arguments[1:], fillvalue="--"):
         if not (name := _setting(argument)):
             continue
         setting = name if name in known else name.replace(".no_", ".")  # of a flag: --a.no-b
         if setting not in known:
-            close = _closest(name, known)
+            turned = re.sub(r"^no_(.*\.|)", r"\1no_", name).replace("_", "-")  # --no-a.b for --a.no-b
+            close = [turned] if name.removeprefix("no_") in known else _closest(name, known)
             hint = f"did you mean {' or '.join(f'--{c}' for c in close)}?" if close else "see --help for all settings"
             raise UserError(f"unknown setting --{name}: {hint}")
+        if isinstance(values[setting], bool) and ("=" in argument or not following.startswith("--")):
+            part, dot, last = setting.replace("_", "-").rpartition(".")
+            flag, off = f"--{part}{dot}{last}", f"--{part}{dot}no-{last}"
+            raise UserError(f"{flag} is a flag without a value: write it alone, or {off} for False")
         found.add(setting)
     return found
 

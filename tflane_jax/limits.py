@@ -19,7 +19,7 @@ import dataclasses
 import enum
 import functools
 import itertools
-import math
+import sys
 import types
 import typing
 from collections.abc import Callable, Iterator
@@ -36,12 +36,13 @@ class SettingError(UserError):
     Attributes:
         setting: its dotted name.
         value: its value.
+        shown: the value in one short line.
         allowed: the allowed values, in words.
     """
 
     def __init__(self, setting: str, value: Any, allowed: str):
-        self.setting, self.value, self.allowed = setting, value, allowed
-        super().__init__(f"{setting} is {_shown(value)}: it must be {allowed}")
+        self.setting, self.value, self.shown, self.allowed = setting, value, _shown(value), allowed
+        super().__init__(f"{setting} is {self.shown}: it must be {allowed}")
 
 
 Rules = Iterator[tuple[str, bool, str]]
@@ -73,6 +74,11 @@ def at_least(least: float) -> Limit:
     return Limit(f"of at least {least:g}", lambda value: value >= least)
 
 
+def counted(least: int, most: int = 2**31 - 1) -> Limit:
+    """Return the limit of whole numbers from `least` to `most`, by default the largest that arrays are indexed with."""
+    return Limit(f"of at least {least} and at most {most}", lambda value: least <= value <= most)
+
+
 def below(end: float) -> Limit:
     """Return the limit of numbers below `end`."""
     return Limit(f"below {end:g}", lambda value: value < end)
@@ -100,8 +106,11 @@ NOT_EMPTY = Limit("at least one of them", lambda items: len(items) > 0)
 SOME_SHARE = Limit("not all 0", lambda items: sum(items) > 0)
 SOME_WEIGHT = Limit("with a weight above 0", lambda pairs: sum(weight for _, weight in pairs) > 0)
 
-Count = Annotated[int, at_least(1)]
-CountOrZero = Annotated[int, at_least(0)]
+Count = Annotated[int, counted(1)]
+CountOrZero = Annotated[int, counted(0)]
+LARGEST_SEED = 2**32 - 1
+"""JAX takes 32 bits of a seed: a larger one would be another one again."""
+Seed = Annotated[int, counted(0, LARGEST_SEED)]
 Positive = Annotated[float, above(0)]
 PositiveOrZero = Annotated[float, at_least(0)]
 PositiveOrInfinite = Annotated[float, Limit("above 0, or inf", lambda value: value > 0, finite=False)]
@@ -199,7 +208,9 @@ def _fits(hint: Any, value: Any, *, finite: bool = True) -> bool:
         pairs = zip(members, value, strict=False)
         return len(members) == len(value) and all(_fits(member, item, finite=finite) for member, item in pairs)
     if hint is float:
-        return isinstance(value, int | float) and not isinstance(value, bool) and (not finite or math.isfinite(value))
+        if not isinstance(value, int | float) or isinstance(value, bool):
+            return False
+        return abs(value) <= sys.float_info.max or (not finite and isinstance(value, float))
     if hint is int:
         return isinstance(value, int) and not isinstance(value, bool)
     if hint is Any or not isinstance(hint, type) or getattr(hint, "_is_protocol", False):
@@ -238,5 +249,8 @@ def _shown(value: Any) -> str:
     """Return a value in one short line."""
     if dataclasses.is_dataclass(value):
         return type(value).__name__ if not isinstance(value, type) else f"the class {value.__name__}"
-    text = value.name if isinstance(value, enum.Enum) else " ".join(repr(value).split())
+    try:
+        text = value.name if isinstance(value, enum.Enum) else " ".join(repr(value).split())
+    except ValueError as error:  # an integer of more than 4300 digits
+        return f"a value that cannot be shown ({str(error).partition(';')[0]})"
     return text if len(text) <= 100 else f"{text[:97]}..."

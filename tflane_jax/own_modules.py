@@ -66,7 +66,7 @@ def import_own() -> None:
         look_in(None)
         try:
             _ = import_file(Path(name)) if name.endswith(".py") else importlib.import_module(name)
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             raise UserError(
                 f"module {name} (--import or {VARIABLE}) cannot be imported: {type(error).__name__}: {error}"
             ) from error

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.shared import ROOT
 from tests.test_cli import fakes  # noqa: F401 (a fixture that is used by itself)
 from tflane_jax.ablations import workers
 from tflane_jax.ablations.declaration import Claim, check
@@ -309,9 +310,17 @@ def test_the_command_lists_tables_and_names_mistakes(capsys):
         assert message in capsys.readouterr().err
 
 
+def test_no_page_is_made_of_a_folder_without_results(tmp_path, capsys):
+    (tmp_path / "empty").mkdir()
+    assert main(["tables", "--record", str(tmp_path / "empty")]) == 2
+    assert "empty holds no results of tables" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["empty"]
+
+
 def test_the_page_is_written_anew_without_a_table(tmp_path, capsys):
     folder = tmp_path / "results"
     folder.mkdir()
+    shutil.copy(ROOT / "docs" / "results" / "markers.3.json", folder)
     assert main(["tables", "--record", str(folder)]) == 0
     assert (tmp_path / "results.md").read_text() == page(folder)
     assert f"written: {tmp_path / 'results.md'}" in capsys.readouterr().out
@@ -328,6 +337,4 @@ def test_every_marker_of_a_table_as_written_enters_by_eq_3_to_the_letter(name):
 
 
 def test_the_page_of_results_is_what_its_summaries_give():
-    from tests.shared import ROOT
-
     assert (ROOT / "docs" / "results.md").read_text() == page(ROOT / "docs" / "results")

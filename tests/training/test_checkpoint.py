@@ -1,5 +1,6 @@
 """Checkpoints: bit-identical round trips, and a clear message for every fault of a folder."""
 
+import errno
 import json
 import shutil
 import sys
@@ -183,6 +184,43 @@ def test_damage_is_named_with_the_remedy(tmp_path, state, damage):
     assert str(folder) in str(error.value)
     assert "delete that folder; the run can go on from step 1" in str(error.value)
     checkpoints.restore(1, state)
+
+
+@pytest.mark.parametrize("where", ["load_arrays", "zlib.crc32", "json.loads"])
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (PermissionError(errno.EACCES, "Permission denied"), "Permission denied; give yourself the right"),
+        (ValueError("RESOURCE_EXHAUSTED: open [os_error_code='24']"), "Too many open files; allow more"),
+        (OSError(errno.EIO, "Input/output error"), "Input/output error; see to that"),
+        (MemoryError(), "not enough memory; free some"),
+        (ModuleNotFoundError("No module named 'orbax'"), "No module named 'orbax'; install that package"),
+        (RuntimeError("can't start new thread"), "can't start new thread; see to that"),
+    ],
+)
+def test_a_checkpoint_that_cannot_be_read_now_is_not_called_damaged(tmp_path, state, monkeypatch, where, error, said):
+    def fail(*_, **__):
+        raise error
+
+    checkpoints = saved(tmp_path, state, [(1, 0.5), (2, None)])
+    monkeypatch.setattr(f"tflane_jax.training.checkpoint.{where}", fail)
+    with pytest.raises(UserError, match=r"^cannot read checkpoint .*step_00000001: ") as caught:
+        checkpoints.arrays(1)
+    assert said in str(caught.value)
+    assert "delete" not in str(caught.value)
+    if where == "json.loads":
+        with pytest.raises(UserError, match="cannot read"):  # nor replaced, which would lose its scores
+            saved(tmp_path, state, [(1, None)])
+
+
+def test_a_folder_that_cannot_be_listed_is_not_called_damaged(tmp_path, state, monkeypatch):
+    def forbidden(path):
+        raise PermissionError(errno.EACCES, "Permission denied", path)
+
+    checkpoints = saved(tmp_path, state, [(1, None)])
+    monkeypatch.setattr("os.scandir", forbidden)
+    with pytest.raises(UserError, match="Permission denied; give yourself the right"):
+        checkpoints.arrays(1)
 
 
 def test_a_checkpoint_of_another_model_is_refused(tmp_path, state):

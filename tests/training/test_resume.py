@@ -16,7 +16,7 @@ from tflane_jax.errors import UserError
 from tflane_jax.training import loop
 from tflane_jax.training.checkpoint import Checkpoints
 from tflane_jax.training.provenance import read_provenance, thread_setting
-from tflane_jax.training.run_folder import claimed
+from tflane_jax.training.run_folder import check_start, claimed
 
 
 def exploding_after(step: int) -> dict:
@@ -75,6 +75,15 @@ def test_a_resumed_run_may_have_other_workers(tmp_path):
     assert json.loads((folder / "config.json").read_text()) == more
     with pytest.raises(UserError, match=r"data\.loading\.where"):
         run(folder, start="resume", resolved=RESOLVED | {"data": {"loading": {"where": "memory"} | workers}})
+
+
+@pytest.mark.parametrize("kind", ["file", "link to itself"])
+def test_a_run_whose_checkpoints_are_no_folder_is_not_begun_anew(tmp_path, kind):
+    (tmp_path / "config.json").touch()
+    place = tmp_path / "checkpoints"
+    place.touch() if kind == "file" else place.symlink_to(place)
+    with pytest.raises(UserError, match="checkpoints is no folder: restore it"):
+        check_start(tmp_path, "resume")
 
 
 def test_a_file_system_without_locks_is_told_and_trained_on(tmp_path, capsys, monkeypatch):

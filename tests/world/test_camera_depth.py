@@ -102,5 +102,7 @@ def test_a_finer_grid_has_the_same_nearest_surfaces():
 
 
 def test_cells_without_pixels_are_refused():
-    with pytest.raises(UserError, match="depth_cell is 0: it must be a whole number of at least 1 or None"):
+    with pytest.raises(
+        UserError, match="depth_cell is 0: it must be a whole number of at least 1 and at most 2147483647 or None"
+    ):
         check_settings(CameraRigConfig(depth_cell=0))

@@ -189,7 +189,6 @@ def declare(
         found = wanted | {"claims": [asdict(claim) for claim in declaration.claims], "seeds": list(seeds)}
         found |= {"begun": begun} | {name: source[name] for name in ("time", "git")}
         found |= {"logs": sorted(logs), "content": files, _CONFIGURATIONS: rows}
-        out.mkdir(parents=True, exist_ok=True)
         write_json(path, found)
     missing = tuple(name for name in (_SECONDARY, _CONFIGURATIONS) if name not in found)
     known = tuple(found.get("logs", sorted(logs)))  # earlier versions wrote down no logs

@@ -118,7 +118,6 @@ def save_plan(plan: Mapping[str, Sequence[Job]], failures: Sequence[Failure], re
         "failed": [str(failure) for failure in failures],
         "scores": results.by_seed(),
     }
-    out.mkdir(parents=True, exist_ok=True)
     return write_json(out / "comparison.json", content)
 
 

@@ -12,6 +12,7 @@ from tflane_jax.ablations.comparison import compact
 from tflane_jax.ablations.scores import with_settings
 from tflane_jax.config import RunConfig
 from tflane_jax.errors import UserError
+from tflane_jax.files.atomic import check_folder
 from tflane_jax.plots.tables import format_table, save_table
 from tflane_jax.progress import progress_bar
 from tflane_jax.runs import Run, load_test_data, open_run
@@ -48,6 +49,7 @@ def sweep(
     """
     if not setting.startswith("data."):
         raise UserError(f"--setting {setting}: give a setting of the data (data...), the models are trained already")
+    check_folder(out)
     runs = {name: runs_below(folder, which) for name, folder in models.items()}
     tested = {
         value: {name: [_tested(run.config, f"--{setting}", value, *overrides) for run in runs[name]] for name in runs}
@@ -81,7 +83,6 @@ def sweep(
         rows += [{setting: value} | row for row in found]
     title = f"{protocol}, test split, {which} checkpoint, percent (mean ± std over seeds)"
     print("\n" + format_table(rows, title=title))
-    out.mkdir(parents=True, exist_ok=True)
     meta = {"protocol": protocol, "checkpoint": which, "setting": setting, "values": list(values), "scores": scores}
     written = list(save_table(out / "sweep", rows, meta, title=title))
     if importlib.util.find_spec("matplotlib") is not None:

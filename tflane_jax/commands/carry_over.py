@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 
 from tflane_jax.errors import UserError
+from tflane_jax.files.atomic import check_folder
 from tflane_jax.training.runtime import configure_jax
 
 
@@ -14,6 +15,7 @@ def run(options: argparse.Namespace) -> int:
         value = getattr(options, name)
         if value is not None and value < 1:
             raise UserError(f"--{name} {value}: at least one")
+    check_folder(options.out)
     configure_jax()
     from tflane_jax.ablations.carry_over import carry_over
     from tflane_jax.ablations.carry_over_plan import Settings

@@ -12,6 +12,8 @@ from tflane_jax.config import load_config
 from tflane_jax.config_files import split_reference
 from tflane_jax.config_overrides import apply_overrides
 from tflane_jax.errors import UserError
+from tflane_jax.files.atomic import check_folder
+from tflane_jax.limits import LARGEST_SEED
 from tflane_jax.training.runtime import configure_jax
 
 
@@ -25,8 +27,11 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> int:
         raise UserError("two of the configurations have the same name: write NAME=FILE to tell them apart")
     if len(set(options.seeds)) < len(options.seeds):
         raise UserError(f"--seeds {' '.join(map(str, options.seeds))}: the seeds must differ")
+    if wrong := [seed for seed in options.seeds if not 0 <= seed <= LARGEST_SEED]:
+        raise UserError(f"--seeds {wrong[0]}: a seed is a whole number from 0 to {LARGEST_SEED}")
     if options.jobs < 1:
         raise UserError(f"--jobs {options.jobs}: at least one training runs at a time")
+    check_folder(options.out)
     configure_jax()
     configs = {
         name: apply_overrides(load_config(reference), [*overrides, *settings])

@@ -18,7 +18,7 @@ from tflane_jax.datasets.base import SPLITS
 from tflane_jax.datasets.batches import prepared
 from tflane_jax.datasets.overlap import overlap, read_drives
 from tflane_jax.errors import UserError
-from tflane_jax.files.atomic import check_stem
+from tflane_jax.files.atomic import check_stem, check_writable
 from tflane_jax.plots import dataset_summary, format_table, save_camera_views, save_table, show_dataset
 from tflane_jax.plots.tables import counted, written_to
 from tflane_jax.scene import RoadImage, stack_examples
@@ -32,6 +32,7 @@ _FORMAT = "argoverse2"  # of `data check`, by default
 
 def show(options: argparse.Namespace) -> int:
     """Draw samples of a split, and print counts of their content."""
+    check_writable(options.out)
     config = RunConfig() if options.config is None else load_config(options.config)
     if options.data is not None and sources.named_source(options.data).example is RoadImage:
         config = _images(config)

@@ -10,6 +10,7 @@ from tflane_jax.datasets.real_maps import RealMapConfig, RealMapDataset
 from tflane_jax.datasets.recorded_logs import RecordedConfig, RecordedDataset
 from tflane_jax.datasets.road_maps import chosen_maps
 from tflane_jax.errors import UserError
+from tflane_jax.files.atomic import check_writable
 from tflane_jax.plots import show_dataset
 from tflane_jax.scene import Example
 from tflane_jax.world.presets import REAL_MAPS
@@ -36,6 +37,7 @@ class _Chosen:
 
 def run(options: argparse.Namespace) -> int:
     """Draw the frames of recorded logs and of the world on their maps, a row for each log."""
+    check_writable(options.out)
     logs = [one.name for one in chosen_maps(options.root, options.logs) if one.recorded]
     if not logs:
         raise UserError(f"{options.root} holds maps without recordings: tflane data show --data real-maps draws those")

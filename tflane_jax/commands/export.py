@@ -10,6 +10,7 @@ import numpy as np
 from tflane_jax.commands.sources import opened
 from tflane_jax.errors import UserError
 from tflane_jax.export import export_model, image_program, latencies, load_program
+from tflane_jax.files.atomic import check_stem, check_writable
 from tflane_jax.plots.tables import format_table, save_table
 from tflane_jax.tasks.lane_shape import LaneShapeTask
 from tflane_jax.training.runtime import configure_jax
@@ -20,6 +21,8 @@ _TOLERANCE = 1e-5  # rounding depends on the batch size
 
 def run(options: argparse.Namespace) -> int:
     """Write the program, and the table of latencies beside it."""
+    check_writable(options.out)
+    check_stem(options.out.with_suffix(""))
     configure_jax()
     run, rest = opened(options)
     if rest:

@@ -14,6 +14,7 @@ from tflane_jax.ablations.paper.table import Conversion, PaperTable
 from tflane_jax.ablations.published import record
 from tflane_jax.ablations.tables import TABLES, find_table
 from tflane_jax.errors import UserError
+from tflane_jax.files.atomic import check_folder
 from tflane_jax.plots.tables import format_table
 from tflane_jax.training.run_folder import is_locked
 from tflane_jax.training.runtime import configure_jax
@@ -39,12 +40,15 @@ def run(options: argparse.Namespace) -> int:
     if not chosen and options.record is not None:
         if not options.record.is_dir():
             raise UserError(f"--record {options.record} is no folder of results, such as docs/results")
+        if not any(options.record.glob("*.json")):
+            raise UserError(f"--record {options.record} holds no results of tables (NAME.json): name docs/results")
         print("written:", record([], options.record))
         return 0
     if not chosen:
         print(format_table([_listed(name) for name in TABLES], digits=0))
         print(f"\n{_totals()}")
         return 0
+    check_folder(options.out)
     configure_jax()
     if jobs > 1 or options.cores is not None:
         accelerators.leave_to_workers()  # before converting uses a device

@@ -11,7 +11,7 @@ import numpy as np
 from tflane_jax.datasets.map_lines import MapLinesConfig
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import BevGrid, PerceptionRange
-from tflane_jax.limits import Count, Positive, SettingError, at_least
+from tflane_jax.limits import Count, Positive, SettingError, counted
 from tflane_jax.markers.pixels import PixelConfig
 from tflane_jax.markers.simulation import MarkerConfig
 from tflane_jax.scene import Example, RoadImage
@@ -62,11 +62,11 @@ class ExampleConfig:
     cameras: CameraRigConfig | None = None
     markers: MarkerConfig | None = None
     lanes: Count = 48
-    lane_points: Annotated[int, at_least(2)] = 11
+    lane_points: Annotated[int, counted(2)] = 11
     segments: Count = 96
-    segment_points: Annotated[int, at_least(2)] = 10
+    segment_points: Annotated[int, counted(2)] = 10
     areas: Count = 32
-    area_points: Annotated[int, at_least(2)] = 20
+    area_points: Annotated[int, counted(2)] = 20
     crossings: Literal["ring", "sides"] = "ring"
     history: Count = 20
     history_hz: Positive | None = None

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from tflane_jax.datasets.map_geometry import MapGeometry
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.geometry.polylines import nearest_lines, resample_lines
-from tflane_jax.limits import Count, at_least
+from tflane_jax.limits import Count, counted
 from tflane_jax.scene import LineClass, MapLines
 from tflane_jax.world.bev.line_of_sight import hidden_points
 
@@ -32,7 +32,7 @@ class MapLinesConfig:
     """
 
     lines: Count = 64
-    points: Annotated[int, at_least(2)] = 20
+    points: Annotated[int, counted(2)] = 20
     centerlines: Literal["exclude", "include"] = "exclude"
 
 

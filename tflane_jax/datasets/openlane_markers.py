@@ -21,7 +21,7 @@ from tflane_jax.datasets.openlane_lanes import FrameLanes, segment_lanes
 from tflane_jax.errors import UserError
 from tflane_jax.files.openlane import FieldNames
 from tflane_jax.geometry import PerceptionRange, invert_pose, relative_pose
-from tflane_jax.limits import CountOrZero, Positive
+from tflane_jax.limits import Positive, Seed
 from tflane_jax.markers.simulation import MarkerConfig, moment_before, simulate_detections
 from tflane_jax.markers.store import MarkerStore, store_of
 from tflane_jax.markers.visibility import in_images
@@ -44,7 +44,7 @@ class BoardsConfig:
             edge (0.5 m) and `placement.setback` to the right of the rightmost lane.
     """
 
-    seed: CountOrZero = 0
+    seed: Seed = 0
     placement: PlacementConfig = PlacementConfig(site="clear")
     lane_width: Positive = 3.5
 

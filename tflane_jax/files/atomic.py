@@ -16,7 +16,7 @@ import os
 import re
 import secrets
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -123,20 +123,34 @@ def _flush_one(path: Path) -> None:
 def check_writable(path: Path | str) -> None:
     """Raise UserError if a file cannot be written there, as far as can be told beforehand; nothing is created."""
     path = Path(path)
+    _check_name(path)
     if os.path.isdir(path):
         raise UserError(f"cannot write {path}: it is a folder; choose another path")
-    temporary = _temporary(path)
+    _check_place(path, _temporary(path), path.absolute().parents)
+
+
+def check_folder(folder: Path | str) -> None:
+    """Raise UserError if files cannot be written into a folder, which need not exist, as `check_writable` does."""
+    folder = Path(folder)
+    _check_place(folder, folder, (folder.absolute(), *folder.absolute().parents))
+
+
+def _check_place(path: Path, probe: Path, above: Sequence[Path]) -> None:
+    """Raise UserError if `path` cannot be a name, or the first of the folders `above` it that exists not be used."""
     try:
-        os.lstat(temporary)
+        str(path.absolute()).encode()
+        os.lstat(probe)
     except (FileNotFoundError, NotADirectoryError):
         pass
+    except UnicodeEncodeError:  # libraries and JSON take no other names
+        raise UserError(f"cannot write {str(path)!a}: the name is not UTF-8; choose another path") from None
     except OSError as error:  # such as a name that is too long
-        raise UserError(_message(path, temporary, error)) from None
-    above = next(parent for parent in path.absolute().parents if os.path.lexists(parent))
-    if not os.path.isdir(above):
-        raise UserError(f"cannot write {path}: {above} is no folder; choose another path")
-    if not os.access(above, os.W_OK | os.X_OK):
-        raise UserError(f"cannot write {path}: no right to write in {above}; choose another path")
+        raise UserError(_message(path, probe, error)) from None
+    found = next(folder for folder in above if os.path.lexists(folder))
+    if not os.path.isdir(found):
+        raise UserError(f"cannot write {path}: {found} is no folder; choose another path")
+    if not os.access(found, os.W_OK | os.X_OK):
+        raise UserError(f"cannot write {path}: no right to write in {found}; choose another path")
 
 
 def check_stem(stem: Path | str) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from tflane_jax.geometry import pose_matrix, pose_yaw, relative_pose, transform_points, yaw_pose
-from tflane_jax.limits import ASCENDING, Count, Fraction, Positive, PositiveOrZero, at_least, within
+from tflane_jax.limits import ASCENDING, Count, Fraction, Positive, PositiveOrZero, counted, within
 from tflane_jax.markers.observe import frame_before
 from tflane_jax.markers.pixels import PixelConfig
 from tflane_jax.markers.visibility import in_images, seen_fraction
@@ -110,7 +110,7 @@ class MarkerConfig:
 
     markers: Count = 2
     lanes: Count = 48
-    points: Annotated[int, at_least(2)] = 11
+    points: Annotated[int, counted(2)] = 11
     radius: Positive = 50.0
     simulation: MarkerSimulationConfig = MarkerSimulationConfig()
     pixels: PixelConfig | None = None

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from tflane_jax.geometry import PerceptionRange
-from tflane_jax.limits import Count, at_least
+from tflane_jax.limits import Count, counted
 from tflane_jax.models.map_lines import LineDecoderConfig, LineOutput, LineQueries, decode_line_layers
 from tflane_jax.scene import AreaPrediction
 
@@ -35,7 +35,7 @@ class AreaDecoderConfig(LineDecoderConfig):
     """
 
     queries: Count = 12
-    points: Annotated[int, at_least(2)] = 20
+    points: Annotated[int, counted(2)] = 20
     coordinates: Literal[3] = 3  # pyright: ignore[reportIncompatibleVariableOverride]
     classes: Literal[2] = AREA_CLASSES  # pyright: ignore[reportIncompatibleVariableOverride]
 

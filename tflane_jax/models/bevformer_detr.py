@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 
 from tflane_jax.geometry.bezier import bezier_basis, bezier_fit
 from tflane_jax.layers.precision import run_layer
-from tflane_jax.limits import Rules, at_least, check_settings
+from tflane_jax.limits import Rules, check_settings, counted
 from tflane_jax.models.auxiliary import AUXILIARY, AuxiliaryName
 from tflane_jax.models.camera_encoder import PAPER_CAMERA_ENCODER, CameraEncoderConfig
 from tflane_jax.models.element_decoder import PAPER_ELEMENT_DECODER, ElementDecoderConfig, ElementOutput
@@ -45,7 +45,7 @@ class BevFormerDetrConfig(HostConfig):
     encoder: EncoderConfig = CameraEncoderConfig()
     decoder: LaneDecoderConfig = LaneDecoderConfig(refine="fixed")
     elements: ElementDecoderConfig | None = ElementDecoderConfig()
-    control_points: Annotated[int, at_least(2)] | None = None
+    control_points: Annotated[int, counted(2)] | None = None
     denoising: DenoisingConfig | None = None
 
     @property

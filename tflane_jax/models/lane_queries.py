@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Int
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.layers.positions import inverse_sigmoid
 from tflane_jax.layers.precision import Precision
-from tflane_jax.limits import Count, FractionBelowOne, Positive, PositiveOrZero, Rules, at_least, splits
+from tflane_jax.limits import Count, FractionBelowOne, Positive, PositiveOrZero, Rules, counted, splits
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ class LaneDecoderConfig:
     heads: Count = 8
     layers: Count = 3
     queries: Count = 48
-    points: Annotated[int, at_least(2)] = 11
+    points: Annotated[int, counted(2)] = 11
     sampling_points: Count = 4
     hidden: Count = 128
     relation: Count = 16

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.layers.initial import uniform_by_fan_in
-from tflane_jax.limits import Count, Limit, Rules, at_least
+from tflane_jax.limits import Count, Limit, Rules, counted
 from tflane_jax.models.lane_decoder import clipped, directions, refined_points, smooth_basis
 from tflane_jax.models.lane_queries import LaneDecoderConfig
 
@@ -42,7 +42,7 @@ class SegmentDecoderConfig(LaneDecoderConfig):
         others: see `LaneDecoderConfig`; `sampling_points` is a multiple of 8 or less than 8, `heads` is even.
     """
 
-    points: Annotated[int, at_least(2)] = 10
+    points: Annotated[int, counted(2)] = 10
     sampling_points: Count = 32
     refine: Literal["point", "iterative"] = "point"  # pyright: ignore[reportIncompatibleVariableOverride]
     offsets: Literal["ego", "lane"] = "ego"

@@ -21,7 +21,7 @@ from tflane_jax.geometry import PerceptionRange
 from tflane_jax.layers.graph import Mlp
 from tflane_jax.layers.positions import inverse_sigmoid, sine_encoding
 from tflane_jax.layers.precision import Precision, run_layer
-from tflane_jax.limits import Count, FractionBelowOne, Positive, Rules, at_least, splits
+from tflane_jax.limits import Count, FractionBelowOne, Positive, Rules, counted, splits
 from tflane_jax.models.lane_decoder import LaneDecoderLayer, clipped
 from tflane_jax.models.lane_denoising import DenoisingConfig, noised_lanes
 from tflane_jax.models.lane_queries import spread_lanes
@@ -61,7 +61,7 @@ class LineDecoderConfig:
     heads: Count = 8
     layers: Count = 3
     queries: Count = 30
-    points: Annotated[int, at_least(2)] = 12
+    points: Annotated[int, counted(2)] = 12
     coordinates: Literal[2, 3] = 2
     classes: Literal[2, 3, 4] = 3
     class_layers: Count = 2

@@ -14,7 +14,7 @@ from flax import struct
 from jaxtyping import Bool, Float
 
 from tflane_jax.geometry.namespace import namespace
-from tflane_jax.limits import Count, Positive, at_least
+from tflane_jax.limits import Count, Positive, counted
 from tflane_jax.scene import MarkerObservations
 from tflane_jax.scene.arrays import Array
 
@@ -34,7 +34,7 @@ class MarkerPriorConfig:
             nothing is detected).
     """
 
-    points: Annotated[int, at_least(2)] = 11
+    points: Annotated[int, counted(2)] = 11
     lanes: Count = 32
     distance_scale: Positive = 40.0
     residual_scale: Positive = 10.0

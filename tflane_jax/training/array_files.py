@@ -27,7 +27,8 @@ def save_arrays(folder: Path, arrays: dict[str, np.ndarray]) -> None:
         with _quiet_if_it_fails(), _checkpointer() as writer:
             writer.save(folder.absolute(), args=ocp.args.PyTreeSave(unflatten_dict(arrays, sep="/")))
     except Exception as error:  # those of orbax and tensorstore for a full disk are no OSError
-        raise error if isinstance(error, OSError) else _os_error(error) from error
+        cause = system_error(error)
+        raise cause if isinstance(cause, OSError) else OSError(first_line(error)) from error
 
 
 @contextlib.contextmanager
@@ -55,11 +56,10 @@ def _quiet_if_it_fails() -> Iterator[None]:
     sys.unraisablehook = show
 
 
-def _os_error(error: Exception) -> OSError:
-    """Return tensorstore's error as that of the system, where its text, a chain of all causes, names one."""
-    text = first_line(error)
-    code = re.search(r"\[os_error_code='(\d+)'\]", text)
-    return OSError(text) if code is None else OSError(int(code[1]), os.strerror(int(code[1])))
+def system_error(error: Exception) -> Exception:
+    """Return an error of tensorstore as that of the system, where its text, a chain of all causes, names one."""
+    code = re.search(r"\[os_error_code='(\d+)'\]", str(error))
+    return error if code is None else OSError(int(code[1]), os.strerror(int(code[1])))
 
 
 def _checkpointer() -> Any:

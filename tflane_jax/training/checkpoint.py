@@ -7,6 +7,7 @@ every file of the state. The folder is written under another name and then renam
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import os
@@ -25,13 +26,29 @@ from flax.traverse_util import unflatten_dict
 
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import rename_flushed
-from tflane_jax.training.array_files import first_line, flat, load_arrays, save_arrays
+from tflane_jax.training.array_files import first_line, flat, load_arrays, save_arrays, system_error
 from tflane_jax.training.state import TrainState, state_from, tree_of
 
 _VERSION = 1
 # In `Manifest.progress`, where versions that do not know it leave it alone: the checksum of the configuration.
 _CONFIG_SUM = "config_sum"
 Which = int | Literal["last", "best"]
+
+# What content raises that is not what was written: wrong values, missing files, other kinds of files.
+_DAMAGE = (
+    *(ValueError, TypeError, LookupError, AttributeError, RecursionError),
+    *(FileNotFoundError, IsADirectoryError, NotADirectoryError),
+)
+_REMEDIES = {
+    errno.EACCES: "give yourself the right to read it",
+    errno.EPERM: "give yourself the right to read it",
+    errno.EMFILE: "allow more open files (ulimit -n)",
+    errno.ENFILE: "allow more open files (ulimit -n)",
+}
+
+
+class _DamagedError(UserError):
+    """The content of a checkpoint is not what was written."""
 
 
 @dataclass(frozen=True)
@@ -126,12 +143,12 @@ class Checkpoints:
         return place
 
     def manifest(self, step: int) -> Manifest:
-        """Return the description of a checkpoint; raises UserError if it is damaged."""
+        """Return the description of a checkpoint; raises UserError if it is damaged or cannot be read."""
         try:
             content = json.loads((self.path(step) / "manifest.json").read_text(encoding="utf-8"))
             manifest = Manifest(**content)
-        except (OSError, ValueError, TypeError, RecursionError) as error:
-            raise self._damaged(step, f"manifest.json: {error}") from error
+        except Exception as error:
+            raise self._unreadable(step, error, "manifest.json: ") from error
         if (wrong := _wrong_entry(manifest)) is not None:
             raise self._damaged(step, f"manifest.json: {wrong} is not what was written")
         if manifest.version != _VERSION:
@@ -185,7 +202,7 @@ class Checkpoints:
         return jax.device_put(state_from(trees | {"key": jax.random.wrap_key_data(trees["key"])}, template))
 
     def arrays(self, step: int) -> dict[str, np.ndarray]:
-        """Return the saved arrays by path ("ema_params/encoder/kernel"); raises UserError if they are damaged."""
+        """Return the saved arrays by path ("ema_params/encoder/kernel"); raises UserError like `manifest`."""
         folder, manifest = self.path(step), self.manifest(step)
         try:
             if (found := _checksums(folder)) != manifest.files:
@@ -195,7 +212,7 @@ class Checkpoints:
         except UserError:
             raise
         except Exception as error:  # orbax and tensorstore have many
-            raise self._damaged(step, first_line(error)) from error
+            raise self._unreadable(step, error) from error
 
     def params(self, step: int) -> dict[str, Any]:
         """Return the averaged parameters of a checkpoint (leading seed axis where it has several), numpy."""
@@ -221,7 +238,7 @@ class Checkpoints:
     def _is_evaluated(self, step: int) -> bool:
         try:
             return bool(self.manifest(step).metrics)
-        except UserError:  # damaged: to be replaced
+        except _DamagedError:  # to be replaced
             return False
 
     def _drop_old(self) -> None:
@@ -241,10 +258,24 @@ class Checkpoints:
         """Return the error for a checkpoint whose entry "progress" the loop cannot read."""
         return self._damaged(step, f"manifest.json: progress: {type(error).__name__}: {error}")
 
+    def _unreadable(self, step: int, error: Exception, what: str = "") -> UserError:
+        """Return the error for a checkpoint whose reading failed; it may be whole, unless its content is the cause."""
+        cause = system_error(error)
+        if isinstance(cause, _DAMAGE):
+            return self._damaged(step, what + first_line(error))
+        reason, remedy = first_line(cause), "see to that and read it again"
+        if isinstance(cause, MemoryError):
+            reason, remedy = "not enough memory", "free some"
+        elif isinstance(cause, ImportError):
+            remedy = "install that package"
+        elif isinstance(cause, OSError):
+            reason, remedy = cause.strerror or reason, _REMEDIES.get(cause.errno or 0, remedy)
+        return UserError(f"cannot read checkpoint {self.path(step)}: {what}{reason}; {remedy}")
+
     def _damaged(self, step: int, why: str) -> UserError:
         others = [other for other in self.steps() if other != step]
         remedy = f"the run can go on from step {others[-1]}" if others else "there is no other: start the run again"
-        return UserError(f"checkpoint {self.path(step)} is damaged ({why}): delete that folder; {remedy}")
+        return _DamagedError(f"checkpoint {self.path(step)} is damaged ({why}): delete that folder; {remedy}")
 
 
 def _remove_unfinished(folder: Path) -> None:
@@ -270,16 +301,21 @@ def _wrong_entry(manifest: Manifest) -> str | None:
         "version": type(manifest.version) is int,
         "config": isinstance(manifest.config, dict),
         "progress": isinstance(manifest.progress, dict),
-        **{
-            name: isinstance(entry, dict) and all(type(value) in (int, float) for value in entry.values())
-            for name, entry in numbers.items()
-        },
+        **{name: isinstance(entry, dict) and all(map(_is_number, entry.values())) for name, entry in numbers.items()},
     }
     return next((name for name, fits in right.items() if not fits), None)
 
 
+def _is_number(value: Any) -> bool:
+    return type(value) is float or (type(value) is int and abs(value) < 2**63)
+
+
 def _checksums(folder: Path) -> dict[str, int]:
-    files = sorted(p for p in (folder / "state").rglob("*") if p.is_file())
+    def refuse(error: OSError) -> None:
+        raise error
+
+    walked = os.walk(folder / "state", onerror=refuse)
+    files = sorted(p for top, _, names in walked for name in names if (p := Path(top, name)).is_file())
     return {p.relative_to(folder).as_posix(): zlib.crc32(p.read_bytes()) for p in files}
 
 

@@ -20,15 +20,16 @@ from tflane_jax.datasets.batches import Prepare, batches, first_example
 from tflane_jax.devices import divided, of_one_process, share, training_mesh
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import write_json, write_text
-from tflane_jax.limits import DIFFERENT, NOT_EMPTY, Count, CountOrZero, Rules, check_settings, splits
+from tflane_jax.limits import DIFFERENT, NOT_EMPTY, Count, Rules, Seed, check_settings, splits
 from tflane_jax.models.parameters import Params
 from tflane_jax.processes import AgreedError, agreed, apart, arrays_from_first, count, from_first, is_first, stop_signal
 from tflane_jax.progress import progress_bar
-from tflane_jax.startup import ready, showing, stage, write
+from tflane_jax.startup import ready, showing, stage
 from tflane_jax.training.adaptive import Memory
 from tflane_jax.training.checkpoint import Checkpoints, Manifest
 from tflane_jax.training.fine_tuning import origins, starting_params
 from tflane_jax.training.interrupt import StopRequest
+from tflane_jax.training.notices import NO_BEST, due_notices, not_finite, print_notices
 from tflane_jax.training.provenance import add_provenance
 from tflane_jax.training.records import Record, RecordWriter, Unwritten, Window, by_name, read_records, seed_record
 from tflane_jax.training.restarts import adapt
@@ -45,10 +46,8 @@ Evaluate = Callable[[Params], dict[str, float]]
 Draw = Callable[[Path, int, Params, list[Record]], None]
 """(run folder, step, averaged parameters of the first seed, all records) -> pictures in the run folder."""
 
-_NO_BEST = (
-    "step {}: the evaluation has no {} (training.best_metric), so no checkpoint is the best; it stays so if the "
-    "validation examples have no such lanes: then choose another score"
-)
+WRONG_PROGRESS = (KeyError, TypeError, ValueError, AttributeError, OverflowError)
+"""What a checkpoint's entry "progress" raises that is not what was written."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +80,7 @@ class TrainingConfig:
     same_examples: bool = False
     accumulate: Count = 1
     shard_state: bool = False
-    seeds: Annotated[tuple[CountOrZero, ...], NOT_EMPTY, DIFFERENT] = (0,)
+    seeds: Annotated[tuple[Seed, ...], NOT_EMPTY, DIFFERENT] = (0,)
     log_every: Count = 50
     eval_every: Count = 1000
     checkpoint_every: Count = 500
@@ -170,7 +169,7 @@ def train(
         def claim() -> None:
             stack.enter_context(claimed(folder, start))
             if start == "resume":
-                _print_notices(check_unchanged(folder, resolved, current_form))
+                print_notices(check_unchanged(folder, resolved, current_form))
                 read_records(folder / "metrics.jsonl")  # if it is damaged, say so before compiling
 
         from_first(claim)
@@ -195,7 +194,7 @@ def train(
             states = per_seed(restored, config.seeds)
             try:
                 window, metrics, times.seconds, memories = _carried(latest["progress"], memories)
-            except (KeyError, TypeError, ValueError, AttributeError) as error:
+            except WRONG_PROGRESS as error:
                 raise checkpoints.damaged_progress(latest["step"], error) from error
         elif (origin := config.init_from) is not None:
             fresh = states
@@ -211,7 +210,7 @@ def train(
         first = step = int(states[0].step)
 
         def begin() -> None:
-            _print_notices(add_provenance(folder, **started_from))
+            print_notices(add_provenance(folder, **started_from))
             write_text(folder / "config.txt", resolved_text)
             write_json(folder / "config.json", resolved)  # last: from here on the folder holds a run
 
@@ -258,7 +257,7 @@ def train(
                 states, values = update_all(update, states, batch)
                 if not values["finite"].all():
                     save({})
-                    raise AgreedError(_not_finite(values, step, config.seeds, checkpoints.path(step)))
+                    raise AgreedError(not_finite(values, step, config.seeds, checkpoints.path(step)))
                 step += 1
                 window.add({name: value for name, value in values.items() if name != "finite"})
                 asked = time.perf_counter()
@@ -271,9 +270,9 @@ def train(
                 if step % config.log_every == 0 or is_last:
                     record = window.record(step)
                     writer.write(record | times.record())
-                    _print_notices(times.notices(step, arrays))  # every process waits for examples of its own
+                    print_notices(times.notices(step, arrays))  # every process waits for examples of its own
                     if is_first():
-                        _print_notices(_due(untold, record))
+                        print_notices(due_notices(untold, record))
                     bar.set_postfix_str(f"loss={np.mean(record['loss']):.4g}{times.shown()}", refresh=False)
                     window = Window()
                 if evaluate is not None and (step % config.eval_every == 0 or is_last):
@@ -281,7 +280,7 @@ def train(
                     evaluations = from_first(lambda measured=measured: measured)
                     writer.write(seed_record(step, "val", scores := by_name(evaluations)))
                     if not metrics and config.best_metric not in scores and is_first():
-                        _print_notices([_NO_BEST.format(step, config.best_metric)])
+                        print_notices([NO_BEST.format(step, config.best_metric)])
                     metrics = {name: float(np.mean(values)) for name, values in scores.items()}
                     if adaptive is not None:
                         together = of_all_seeds([state.opt_state for state in states])
@@ -324,27 +323,3 @@ def _carried(saved: dict[str, Any], fresh: list[Memory]) -> tuple[Window, dict[s
     window = Window(int(saved["window"]["steps"]), sums)
     metrics = {name: float(value) for name, value in saved["metrics"].items()}
     return window, metrics, float(saved["seconds"]), [Memory(**one) for one in saved.get("cycles", [])] or fresh
-
-
-def _not_finite(values: dict[str, np.ndarray], step: int, seeds: tuple[int, ...], kept: Path) -> str:
-    """Return a message with the step, the seed and everything that is not finite: loss terms, loss, gradient."""
-    bad = int(np.argmin(np.atleast_1d(values["finite"])))
-    numbers = {name: float(np.atleast_1d(value)[bad]) for name, value in values.items()}
-    terms = [name for name, value in sorted(numbers.items(), reverse=True) if not np.isfinite(value)]
-    what = ", ".join(f"{name} = {numbers[name]}" for name in terms)
-    return (
-        f"step {step + 1}, seed {seeds[bad]}: {what} is not finite. The last good state (step {step}) is kept in "
-        f"{kept}. Lower optim.lr or optim.clip_norm and train into another folder, from the start or from this run's "
-        "averaged parameters (training.init_from)"
-    )
-
-
-def _due(untold: dict[str, str], record: Record) -> list[str]:
-    """Return the notices whose terms are above 0 in a record, and take them from `untold`."""
-    due = [name for name in untold if np.max(record.get(name, 0.0)) > 0]
-    return [f"step {record['step']}: {name} is {np.max(record[name]):.3g}. {untold.pop(name)}" for name in due]
-
-
-def _print_notices(notices: Sequence[str]) -> None:
-    for notice in notices:
-        write(notice)

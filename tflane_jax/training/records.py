@@ -21,9 +21,9 @@ Record = dict[str, Any]
 
 
 def read_records(path: Path) -> list[Record]:
-    """Return the records of a metrics.jsonl in order, up to the first line that is none (a last one may be cut short).
+    """Return the records of a metrics.jsonl in order, without the last line if that is none (it may be cut short).
 
-    Raises UserError if the file cannot be read as text.
+    Raises UserError if the file cannot be read as text, or names an earlier line that is no record.
     """
     if not path.exists():
         return []
@@ -32,14 +32,15 @@ def read_records(path: Path) -> list[Record]:
     except UserError as error:
         raise UserError(f"{error}: move it away, the run goes on without its earlier records") from error
     records = []
-    for line in lines:
+    for number, line in enumerate(lines, start=1):
         try:
             record = json.loads(line)
         except (ValueError, RecursionError):
-            break
-        if not _is_record(record):
-            break
-        records.append(record)
+            record = None
+        if _is_record(record):
+            records.append(record)
+        elif number < len(lines):
+            raise UserError(f"{path}, line {number} is no record: correct or delete that line; the others are kept")
     return records
 
 

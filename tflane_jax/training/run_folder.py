@@ -11,6 +11,7 @@ evaluations/              tables of `tflane eval`
 from __future__ import annotations
 
 import contextlib
+import os
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -136,6 +137,9 @@ def check_start(folder: Path, start: Start) -> None:
         )
     if start == "resume" and not holds_run:
         raise UserError(f"{folder} holds no run to resume: leave --resume out to start one")
+    checkpoints = folder / "checkpoints"
+    if start == "resume" and os.path.lexists(checkpoints) and not checkpoints.is_dir():
+        raise UserError(f"{checkpoints} is no folder: restore it, or start the run again with --overwrite")
     if start == "overwrite" and (links := [folder / name for name in _CONTENT if (folder / name).is_symlink()]):
         raise UserError(
             f"{links[0]} is a link, and what it points to is not deleted: remove the link, or choose another folder "

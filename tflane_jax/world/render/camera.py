@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 
 from tflane_jax.geometry.cameras import ground_points
 from tflane_jax.geometry.poses import invert_pose
-from tflane_jax.limits import PositiveOrZero, PositiveRange, Range, at_least
+from tflane_jax.limits import PositiveOrZero, PositiveRange, Range, counted
 
 # Image size to which focal lengths and rows refer: TuSimple's, pixels.
 REFERENCE_WIDTH, REFERENCE_HEIGHT = 1280, 720
@@ -37,8 +37,8 @@ class FrontCameraConfig:
         centre: largest shift of the principal point at 1280 pixels of width, pixels.
     """
 
-    width: Annotated[int, at_least(16)] = 640
-    height: Annotated[int, at_least(16)] = 360
+    width: Annotated[int, counted(16)] = 640
+    height: Annotated[int, counted(16)] = 360
     focal: PositiveRange = (900.0, 1100.0)
     above_ground: PositiveRange = (1.45, 1.75)
     pitch: Range = (4.6, 7.6)

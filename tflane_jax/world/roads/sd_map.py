@@ -17,7 +17,7 @@ from jaxtyping import Float
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import BevGrid, PerceptionRange, clip_to_range, invert_pose, resample_lines, transform_points
 from tflane_jax.geometry.poses import yaw_pose
-from tflane_jax.limits import Count, Positive, PositiveOrZero, at_least
+from tflane_jax.limits import Count, Positive, PositiveOrZero, counted
 from tflane_jax.scene import SdCategory, SdMap
 from tflane_jax.scene.logs import Log
 
@@ -46,7 +46,7 @@ class SdMapConfig:
     """
 
     lines: Count = 24
-    points: Annotated[int, at_least(2)] = 11
+    points: Annotated[int, counted(2)] = 11
     range: PerceptionRange = BevGrid().range
     tolerance: PositiveOrZero = 1.0
     survey: PositiveOrZero = 1.5

@@ -1,0 +1,41 @@
+"""What a training tells its user beside its progress."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from tflane_jax.startup import write
+from tflane_jax.training.records import Record
+
+NO_BEST = (
+    "step {}: the evaluation has no {} (training.best_metric), so no checkpoint is the best; it stays so if the "
+    "validation examples have no such lanes: then choose another score"
+)
+
+
+def not_finite(values: dict[str, np.ndarray], step: int, seeds: tuple[int, ...], kept: Path) -> str:
+    """Return a message with the step, the seed and everything that is not finite: loss terms, loss, gradient."""
+    bad = int(np.argmin(np.atleast_1d(values["finite"])))
+    numbers = {name: float(np.atleast_1d(value)[bad]) for name, value in values.items()}
+    terms = [name for name, value in sorted(numbers.items(), reverse=True) if not np.isfinite(value)]
+    what = ", ".join(f"{name} = {numbers[name]}" for name in terms)
+    return (
+        f"step {step + 1}, seed {seeds[bad]}: {what} is not finite. The last good state (step {step}) is kept in "
+        f"{kept}. Lower optim.lr or optim.clip_norm and train into another folder, from the start or from this run's "
+        "averaged parameters (training.init_from)"
+    )
+
+
+def due_notices(untold: dict[str, str], record: Record) -> list[str]:
+    """Return the notices whose terms are above 0 in a record, and take them from `untold`."""
+    due = [name for name in untold if np.max(record.get(name, 0.0)) > 0]
+    return [f"step {record['step']}: {name} is {np.max(record[name]):.3g}. {untold.pop(name)}" for name in due]
+
+
+def print_notices(notices: Sequence[str]) -> None:
+    """Write each notice on a line of its own."""
+    for notice in notices:
+        write(notice)

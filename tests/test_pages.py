@@ -102,7 +102,7 @@ def test_the_first_training_of_the_readme_is_not_refused():
     [
         ("train --config tf_lane/argoverse2 --data.root LOGS", "unknown setting --data.root"),
         ("train --config camera/toponet_r50 --data.root ROOT", "would stay random"),
-        ("train --config markers/toponet_r50 --task.model.encoder.bev.remat True", "True"),
+        ("train --config markers/toponet_r50 --task.model.encoder.bev.remat True", "is a flag without a value"),
         ("data stats --data argoverse2 --root LOGS --data.example.history-hz 2", "data.world.keyframes"),
         ("eval RUN --evaluation.versions v1.0", "unknown argument --evaluation.versions"),
         ("predict RUN --split all", "wrong arguments"),

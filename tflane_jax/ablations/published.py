@@ -87,7 +87,7 @@ def _section(summary: Mapping[str, Any]) -> list[str]:
     cores = _listed(summary["cores of a run"])
     rows = _without_repeated(summary["rows"])
     facts = (
-        f"{counted(len(summary['seeds']), 'seed')}, {_updates(summary['steps'])}, each on {cores} "
+        f"{_seeds(summary)}, {_updates(summary['steps'])}, each on {cores} "
         f"core{'' if cores == '1' else 's'} ({_listed(summary['devices'])}); the updates of a run took "
         f"{_between(minutes.values())} minutes, other work beside it; code {_listed(summary['commits'])}. "
         f"{summary['protocol']}, test split of the built-in world, percent (mean ± std over seeds). "
@@ -120,6 +120,13 @@ def _section(summary: Mapping[str, Any]) -> list[str]:
         lines += ["", *_wrapped(f"The paper's own numbers: {quoted['source']}."), ""]
         lines.append(format_table(quoted["rows"], digits=2))
     return lines
+
+
+def _seeds(summary: Mapping[str, Any]) -> str:
+    """Return how many seeds a table has, and the least that a row has where it has fewer."""
+    most = len(summary["seeds"])
+    least = min((row.get("seeds", most) for row in summary["rows"]), default=most)
+    return counted(most, "seed") if least == most else f"{least} to {most} seeds"
 
 
 def _interim(summary: Mapping[str, Any]) -> str:

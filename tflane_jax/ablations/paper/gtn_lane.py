@@ -35,7 +35,7 @@ _QUOTED = Quoted(
     ),
 )
 _BY_HAND = "Learning rates were chosen by hand, not by the table's search."
-_SPEED = "Frames per second depend on the machine and are in docs/benchmarks.md (LSTR)."
+_SPEED = "Frames per second are not measured; docs/benchmarks.md compares the networks' times with PyTorch's."
 
 
 def _rows(config: str, rates: dict[str, str], names: tuple[str, ...], starts: str = "") -> tuple[TableRow, ...]:

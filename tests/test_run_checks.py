@@ -101,7 +101,7 @@ WRONG = {
         "task.model.decoder.queries": (0, -5),
         "task.model.decoder.points": (1, 12),
         "task.model.decoder.dropout": (1.0, -0.1),
-        "task.model.decoder.sampling_points": (12,),
+        "task.model.decoder.sampling_points": (0,),
         "task.model.decoder.metres": ((5.0, 5.0), (5.0, 0.0, 0.3)),
         "task.model.priors.traffic_flow.prior.frames": (0, 40),
         "task.model.priors.traffic_flow.prior.min_valid_frames": (0, 21),

@@ -215,7 +215,7 @@ def calibrated(part, **values):
     ("damage", "said"),
     [
         (lambda folder: next((folder / "train/01000/image/CAM_BACK").iterdir()).unlink(), "cannot read .*CAM_BACK"),
-        (copied_image, "the first image of CAM_FRONT 48 x 16, and one of them is not the original"),
+        (copied_image, "the first image of CAM_FRONT is 48 x 16: one of them is not the original"),
         (lambda folder: info(folder).write_text("{"), "is no JSON file"),
         (lambda folder: change(info(folder), lambda content: content.pop("sensor")), "lacks the entry 'sensor'"),
         (calibrated("intrinsic", K=[[1, 0, 0], [0, 0, 0], [0, 0, 1]]), "is no camera matrix"),

@@ -140,7 +140,7 @@ class Straight(LaneShapeTask):
 
 
 def test_streamed_images_are_evaluated_as_those_in_memory(root, monkeypatch):
-    monkeypatch.setattr("tflane_jax.tasks.lane_shape._loss", lambda task, curves, lines: lines.points.sum())
+    monkeypatch.setattr("tflane_jax.tasks.lane_shape._losses", lambda task, curves, lines: lines.points.sum((1, 2, 3)))
     kept, read = (
         Straight().evaluate({}, loaded(root, where), EvaluationConfig(batch_size=3)) for where in ("memory", "disk")
     )

@@ -91,8 +91,8 @@ def camera_views(
         if image.shape[1::-1] != fit.source:
             raise UserError(
                 f"{camera.image} is {image.shape[1]} x {image.shape[0]} pixels, the first image of {camera.name} "
-                f"{fit.source[0]} x {fit.source[1]}, and one of them is not the original file: tflane data check "
-                "--format openlane-v2 compares all"
+                f"is {fit.source[0]} x {fit.source[1]}: one of them is not the original file, restore it (`tflane data "
+                "check` compares all)"
             )
         views.image[place, : fit.size[1], : fit.size[0]] = fit.image(image)
         views.size[place] = fit.size

@@ -96,7 +96,8 @@ def fit_photo(image: UInt8[np.ndarray, "h w 3"], camera: PhotoCamera | Placement
         raise UserError(f"a photo of {width} x {height} pixels shows nothing: give another")
     seen = camera if isinstance(camera, Placement) else _seen(height, width, camera or PhotoCamera())
     part = image[max(seen.top, 0) : seen.top + seen.height, seen.left : seen.left + seen.width]
-    part = np.pad(part, ((max(-seen.top, 0), 0), (0, 0), (0, 0)))
+    if seen.top < 0:
+        part = np.pad(part, ((-seen.top, 0), (0, 0), (0, 0)))
     if seen.width > 2 * WIDTH or seen.height > 2 * HEIGHT:
         cv2 = opencv()
         fitted = cv2.resize(part, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA)

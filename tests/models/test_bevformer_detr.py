@@ -80,9 +80,10 @@ DETR = BevFormerDetrConfig(
 
 def test_true_lanes_are_noised_as_control_points():
     """A straight lane of 11 points has five control points, equally spaced; other lanes are padding, NaN here."""
-    lanes = make_example(lanes=2).lanes
+    example = make_example(lanes=2)
+    lanes = example.lanes
     lanes.points[2:] = np.nan
-    taken, _ = DETR.build().apply({}, lanes, method="_in_controls", mutable=[AUXILIARY])
+    taken, _ = DETR.build().apply({}, example, method="true_lanes", mutable=[AUXILIARY])
     expected = np.linspace(lanes.points[:2, 0], lanes.points[:2, -1], 5, axis=1)
     np.testing.assert_allclose(taken.points[:2], expected, atol=1e-4)
     np.testing.assert_array_equal(taken.valid, lanes.valid)

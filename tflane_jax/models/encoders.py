@@ -9,10 +9,8 @@ from functools import partial
 from typing import Any
 
 from tflane_jax.errors import UserError
-from tflane_jax.limits import Rules
 from tflane_jax.models.bev_encoder import BevFormerConfig, BevMemory
 from tflane_jax.models.camera_encoder import CameraEncoderConfig, EncoderOutput
-from tflane_jax.models.element_decoder import ElementDecoderConfig
 from tflane_jax.models.evidence_encoder import EvidenceEncoderConfig
 from tflane_jax.models.prior import BevHook
 from tflane_jax.scene import Example
@@ -83,17 +81,3 @@ def start_bev_memory(config: EncoderConfig) -> BevMemory | None:
     if isinstance(config, CameraEncoderConfig) and isinstance(config.bev, BevFormerConfig):
         return BevMemory.empty(config.bev) if config.bev.memory == "previous" else None
     return None
-
-
-def element_limits(elements: ElementDecoderConfig | None, encoder: EncoderConfig, layers: int) -> Rules:
-    """Yield the limits of a host's traffic elements: a front view, and as many layers as the lane decoder."""
-    if elements is None:
-        return
-    seen = isinstance(encoder, CameraEncoderConfig)
-    yield "elements", seen, "None without an encoder of cameras: traffic elements are detected in the front image"
-    fits = elements.layers == layers
-    yield "elements.layers", fits, f"decoder.layers ({layers}): a lane layer reads the element layer of its index"
-    if isinstance(encoder, CameraEncoderConfig):
-        pyramid = encoder.images.pyramid
-        yield "elements.levels", elements.levels == pyramid.levels, f"encoder.images.pyramid.levels ({pyramid.levels})"
-        yield "elements.dim", elements.dim == pyramid.dim, f"encoder.images.pyramid.dim ({pyramid.dim})"

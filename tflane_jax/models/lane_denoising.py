@@ -18,10 +18,8 @@ from jaxtyping import Array, Float
 
 from tflane_jax.geometry import PerceptionRange, transform_points, yaw_pose
 from tflane_jax.limits import Count, Fraction, PositiveOrZero
-from tflane_jax.models.auxiliary import AUXILIARY, AuxiliaryName
-from tflane_jax.models.element_decoder import ElementOutput
-from tflane_jax.models.lane_proposals import LaneProposals
-from tflane_jax.models.lane_queries import LaneDecoderConfig, LaneQueries
+from tflane_jax.models.auxiliary import AUXILIARY
+from tflane_jax.models.lane_queries import LaneDecoderConfig
 from tflane_jax.scene import LaneGraph, MapLines, Prediction
 
 
@@ -76,48 +74,11 @@ class NoisedQueries(nn.Module):
         return jnp.broadcast_to(content, position.shape), position, lax.stop_gradient(reference)
 
 
-def lane_auxiliary(config: LaneDecoderConfig, noise: DenoisingConfig | None) -> tuple[AuxiliaryName, ...]:
-    """Return the auxiliary outputs of `decode_lanes`."""
-    denoised: tuple[AuxiliaryName, ...] = () if noise is None else ("denoised",)
-    return denoised if config.proposals is None else (*denoised, "lane_proposals")
-
-
-def decode_lanes(
-    host: Any,
-    config: LaneDecoderConfig,
-    bev: Float[Array, "h w e"],
-    elements: ElementOutput | None,
-    tokens: Any,
-    lanes: LaneGraph | None,
-    deterministic: bool,
-) -> Prediction:
-    """Return the predictions of learned queries, and sow those of denoising queries as auxiliary output `denoised`.
-
-    Both kinds pass through the same decoder without exchanging information.
-
-    Args:
-        host: module with `config.denoising` and the decoder, `decode_queries(start, bev, elements, tokens,
-            deterministic)`, where `start` is as from `LaneQueries`.
-        config: sizes of the queries.
-        bev, elements, tokens, deterministic: passed to `decode_queries`.
-        lanes: ground truth to denoise (lanes, or lane segments); not used otherwise.
-    """
-    range_, noise = host.config.spec.bev_range, host.config.denoising
-    start = LaneQueries(config, range_, name="queries")()
-    if config.proposals is not None:
-        proposed = LaneProposals(config, range_, name="proposals")(bev, lanes)
-        start = jax.tree.map(lambda *parts: jnp.concatenate(parts), start, proposed)
-    if noise is None or lanes is None or not host.is_mutable_collection(AUXILIARY):
-        return host.decode_queries(start, bev, elements, tokens, deterministic)
-    noised = NoisedQueries(config, noise, range_, name="noised")(lanes)
-    return decode_groups(host, start, noised, bev, elements, tokens, deterministic)
-
-
 def decode_groups(host: Any, start: Any, noised: Any, *arguments: Any) -> Prediction:
     """Return the predictions of the queries `start`, and sow those of `noised`, with a leading axis over copies.
 
     Args:
-        host: as of `decode_lanes`.
+        host: module with `decode_queries(start, bev, elements, tokens, deterministic)`.
         start, noised: first argument of `decode_queries`.
         arguments: the others; the same for all groups.
     """

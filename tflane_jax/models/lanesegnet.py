@@ -4,10 +4,6 @@ Images -> BEV features -> segment queries -> (priors) -> decoder layers -> cente
 masks -> topology of the last layer. The small version reads BEV evidence instead of images; decoder, heads and losses
 are the same. The map-element-bucket variant has decoders of their own for areas and traffic elements.
 Source: docs/reference/lanesegnet.md.
-
-Read from top to bottom: `Host.__call__` encodes, `decode_example` adds the truth that training may use, `decode` calls
-`lane_denoising.decode_lanes`, and this calls `decode_queries`, the decoder layer by layer. Between these calls, only
-queries are made: the paper's learned ones (`LaneQueries`) and, in small models, proposals and noised segments.
 """
 
 from __future__ import annotations
@@ -25,13 +21,11 @@ from jaxtyping import Array, Float
 from tflane_jax.layers.precision import run_layer
 from tflane_jax.limits import Rules, check_settings
 from tflane_jax.models.area_decoder import PAPER_AREA_DECODER, AreaDecoder, AreaDecoderConfig
-from tflane_jax.models.auxiliary import AUXILIARY, AuxiliaryName
+from tflane_jax.models.auxiliary import AUXILIARY
 from tflane_jax.models.camera_encoder import PAPER_CAMERA_ENCODER
-from tflane_jax.models.element_decoder import PAPER_ELEMENT_DECODER, ElementOutput
-from tflane_jax.models.encoders import element_limits
-from tflane_jax.models.host import Host, HostConfig
+from tflane_jax.models.element_decoder import PAPER_ELEMENT_DECODER
 from tflane_jax.models.lane_decoder import LaneDecoderLayer, lane_position, relate
-from tflane_jax.models.lane_denoising import DenoisingConfig, decode_lanes, lane_auxiliary
+from tflane_jax.models.lane_host import LaneHost, LaneHostConfig
 from tflane_jax.models.lane_segments import (
     PAPER_SEGMENT_DECODER,
     SegmentDecoderConfig,
@@ -41,28 +35,26 @@ from tflane_jax.models.lane_segments import (
 )
 from tflane_jax.models.parameters import with_equal_heads
 from tflane_jax.models.prior import HostQueries
-from tflane_jax.models.priors import ByPrior, fuse_into_queries
+from tflane_jax.models.priors import fuse_into_queries
 from tflane_jax.models.segment_truth import Center, ordered_targets, target_lanes
-from tflane_jax.scene import ElementPrediction, LaneGraph, Prediction, SegmentPrediction
+from tflane_jax.scene import ElementPrediction, Example, LaneGraph, Prediction, SegmentPrediction
 
 
 @dataclass(frozen=True, kw_only=True)
-class LaneSegNetConfig(HostConfig):
+class LaneSegNetConfig(LaneHostConfig):
     """Configuration of LaneSegNet; without priors, the vision-only baseline.
 
     Attributes:
         decoder: segment decoder.
-        denoising: noised segments in training (`models.lane_denoising`); None as in the paper.
         last_step: "twice": outside training, the last layer's change of the centerline is applied to its own result
             once more. The published code does so by mistake, and its weights reach their published numbers with it.
         center: the centerline that is learned, see `segment_truth.segment_targets`.
         areas: decoder of crossings and road boundaries, as in the map-element-bucket variant; crossings are then no
             class of the segments (`decoder.classes=1`). None: crossings are segments of the second class.
-        encoder, range, priors, elements: see `HostConfig`; elements need as many layers as the decoder.
+        encoder, range, priors, elements, denoising: see `LaneHostConfig`.
     """
 
     decoder: SegmentDecoderConfig = SegmentDecoderConfig()
-    denoising: DenoisingConfig | None = None
     last_step: Literal["once", "twice"] = "once"
     center: Center = "mean"
     areas: AreaDecoderConfig | None = None
@@ -72,19 +64,9 @@ class LaneSegNetConfig(HostConfig):
     elements_of: ClassVar[Literal["lanes", "segments"]] = "segments"
 
     @property
-    def query_dim(self) -> int:
-        """Channels of a query."""
-        return self.decoder.dim
-
-    @property
     def wanted_truth(self) -> tuple[str, ...]:
         """Segments; crossings too where they are segments of the second class."""
         return self.truth if self.areas is None else ("segments",)
-
-    @property
-    def auxiliary(self) -> tuple[AuxiliaryName, ...]:
-        """Those of the lane decoder, and those of every host."""
-        return (*lane_auxiliary(self.decoder, self.denoising), *super().auxiliary)
 
     @property
     def example_points(self) -> dict[str, tuple[int, str]]:
@@ -112,9 +94,8 @@ class LaneSegNetConfig(HostConfig):
         return LaneSegNet(self)
 
     def limits(self) -> Rules:
-        """Those of a host with traffic elements; crossings are a class of segments or areas with their own decoder."""
+        """Those of a host of lanes; crossings are a class of segments or areas with their own decoder."""
         yield from super().limits()
-        yield from element_limits(self.elements, self.encoder, self.decoder.layers)
         fits = (self.areas is None) == (self.decoder.classes == 2)
         yield "decoder.classes", fits, "1 with areas, which then hold the crossings, and 2 without (areas is None)"
 
@@ -133,7 +114,7 @@ def paper_bucket_config() -> LaneSegNetConfig:
     )
 
 
-class LaneSegNet(Host):
+class LaneSegNet(LaneHost):
     """From one example to the predictions of every decoder layer."""
 
     config: LaneSegNetConfig
@@ -145,62 +126,28 @@ class LaneSegNet(Host):
         variables = with_equal_heads(super().init(*args, **kwargs), config.decoder.layers)
         return variables if config.areas is None else with_equal_heads(variables, config.areas.layers, "areas")
 
-    def decode_example(self, example, bev, elements, tokens, *, deterministic):
-        config, lanes = self.config, None
-        taught = lane_auxiliary(config.decoder, config.denoising) and self.is_mutable_collection(AUXILIARY)
-        if taught and example.segments is not None:
-            lanes = target_lanes(
-                ordered_targets(example.segments, example.areas, config.center, config.decoder.classes)
-            )
-        return self.decode(bev, tokens, lanes, elements, deterministic=deterministic)
+    def true_lanes(self, example: Example) -> LaneGraph | None:
+        """Return the centerlines of the true segments where training needs them."""
+        config, learned = self.config, {"denoised", "lane_proposals"} & set(self.config.auxiliary)
+        if not learned or example.segments is None or not self.is_mutable_collection(AUXILIARY):
+            return None
+        return target_lanes(ordered_targets(example.segments, example.areas, config.center, config.decoder.classes))
 
     @nn.compact
-    def decode(
-        self,
-        bev: Float[Array, "h w e"],
-        tokens: ByPrior | None = None,
-        lanes: LaneGraph | None = None,
-        elements: ElementOutput | None = None,
-        *,
-        deterministic: bool = True,
-    ) -> Prediction:
-        """Return segments of every decoder layer and the topology of the last, from BEV features and prior tokens.
+    def decode(self, bev, elements=None, tokens=None, lanes=None, *, deterministic=True) -> Prediction:
+        """Return segments of every decoder layer, the topology of the last, and areas; see `LaneHost.decode`.
 
-        Masks are predicted in training only. Sows the queries of every layer as `layer_queries` if the collection
-        `intermediates` is mutable.
-
-        Args:
-            bev: BEV features, row 0 at the smallest y, column 0 at the smallest x.
-            tokens: of the priors, by name.
-            lanes: ground truth of denoising and proposals; not used otherwise.
-            elements: outputs of the traffic-element decoder, or None.
-            deterministic: no dropout, and the form of the evaluation.
+        Masks are predicted in training only.
         """
         config, spec = self.config, self.config.spec
-        found = decode_lanes(self, config.decoder, bev, elements, tokens or {}, lanes, deterministic)
+        found = self.decode_lanes(bev, elements, tokens or {}, lanes, deterministic)
         if config.areas is None:
             return found
         assert found.segments is not None
         areas = AreaDecoder(config.areas, spec.bev_range, spec.range, name="areas")(bev, deterministic=deterministic)
         return replace(found, segments=replace(found.segments, areas=areas))
 
-    def decode_queries(
-        self,
-        start: tuple[Float[Array, "q c"], Float[Array, "q c"], Float[Array, "q p 3"]],
-        bev: Float[Array, "h w e"],
-        elements: ElementOutput | None,
-        tokens: ByPrior,
-        deterministic: bool,
-    ) -> Prediction:
-        """Return the predictions of one set of queries.
-
-        Args:
-            start: content, position and initial centerlines in [0, 1] of the BEV range, as from `LaneQueries`.
-            bev, tokens: see `decode`.
-            elements: E traffic elements of every decoder layer: queries (D, E, C), boxes (D, E, 2, 2) in pixels, logits
-                (D, E, K). Only the queries of the last layer are read, for the topology with the segments. Or None.
-            deterministic: no dropout, no masks, and the form of the evaluation.
-        """
+    def decode_queries(self, start, bev, elements, tokens, deterministic) -> Prediction:
         config, spec, (queries, position, reference) = self.config.decoder, self.config.spec, start
         training = not deterministic
         # Both boundaries start at the centerline.
@@ -224,6 +171,7 @@ class LaneSegNet(Host):
         found = make_prediction(outputs, successor)
         if elements is None:
             return found
+        # Only the queries of the last layer meet the segments.
         governed = relate(self, config, "element_lane", queries, elements.queries[-1])
         return replace(found, elements=ElementPrediction(elements.box, elements.logits, governed[None]))
 

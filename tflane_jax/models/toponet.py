@@ -11,18 +11,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import partial
 
-import flax.linen as nn
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
 from tflane_jax.layers.graph import ElementNodes, edge_probabilities
 from tflane_jax.layers.precision import run_layer
-from tflane_jax.limits import PositiveOrZero, Rules, check_settings
-from tflane_jax.models.auxiliary import AuxiliaryName
+from tflane_jax.limits import PositiveOrZero, check_settings
 from tflane_jax.models.camera_encoder import PAPER_CAMERA_ENCODER
-from tflane_jax.models.element_decoder import PAPER_ELEMENT_DECODER, ElementOutput
-from tflane_jax.models.encoders import element_limits
-from tflane_jax.models.host import Host, HostConfig
+from tflane_jax.models.element_decoder import PAPER_ELEMENT_DECODER
 from tflane_jax.models.lane_decoder import (
     ElementEmbedding,
     LaneDecoderLayer,
@@ -32,52 +27,28 @@ from tflane_jax.models.lane_decoder import (
     make_prediction,
     next_reference,
 )
-from tflane_jax.models.lane_denoising import DenoisingConfig, decode_lanes, lane_auxiliary
-from tflane_jax.models.lane_queries import PAPER_LANE_DECODER, LaneDecoderConfig
+from tflane_jax.models.lane_host import LaneHost, LaneHostConfig
+from tflane_jax.models.lane_queries import PAPER_LANE_DECODER
 from tflane_jax.models.prior import HostQueries
-from tflane_jax.models.priors import ByPrior, fuse_into_queries
-from tflane_jax.scene import LaneGraph, Prediction
+from tflane_jax.models.priors import fuse_into_queries
+from tflane_jax.scene import Prediction
 
 
 @dataclass(frozen=True, kw_only=True)
-class TopoNetConfig(HostConfig):
+class TopoNetConfig(LaneHostConfig):
     """Configuration of TopoNet; without priors, the vision-only baseline.
 
     Attributes:
-        decoder: lane decoder.
         edge_weight: weight of neighbours in the scene graph.
-        denoising: noised lanes in training (`models.lane_denoising`); None as in the paper.
-        encoder, range, priors, elements: see `HostConfig`; elements need as many layers as the decoder.
+        encoder, range, priors, elements, decoder, denoising: see `LaneHostConfig`.
     """
 
-    decoder: LaneDecoderConfig = LaneDecoderConfig()
     edge_weight: PositiveOrZero = 0.6
-    denoising: DenoisingConfig | None = None
-
-    @property
-    def query_dim(self) -> int:
-        """Channels of a query."""
-        return self.decoder.dim
-
-    @property
-    def auxiliary(self) -> tuple[AuxiliaryName, ...]:
-        """Those of the lane decoder, and those of every host."""
-        return (*lane_auxiliary(self.decoder, self.denoising), *super().auxiliary)
-
-    @property
-    def example_points(self) -> dict[str, tuple[int, str]]:
-        """Lanes are compared point by point."""
-        return {"lane_points": (self.decoder.points, "as many as it predicts for a lane (task.model.decoder.points)")}
 
     def build(self) -> TopoNet:
         """Return the Linen module; raises UserError where encoder, decoder and elements do not fit together."""
         check_settings(self)
         return TopoNet(self)
-
-    def limits(self) -> Rules:
-        """Those of a host with traffic elements."""
-        yield from super().limits()
-        yield from element_limits(self.elements, self.encoder, self.decoder.layers)
 
 
 def paper_config() -> TopoNetConfig:
@@ -87,32 +58,12 @@ def paper_config() -> TopoNetConfig:
     )
 
 
-class TopoNet(Host):
+class TopoNet(LaneHost):
     """From one example to the predictions of every decoder layer."""
 
     config: TopoNetConfig
 
-    def decode_example(self, example, bev, elements, tokens, *, deterministic):
-        return self.decode(bev, elements, tokens, example.lanes, deterministic=deterministic)
-
-    @nn.compact
-    def decode(
-        self,
-        bev: Float[Array, "h w e"],
-        elements: ElementOutput | None = None,
-        tokens: ByPrior | None = None,
-        lanes: LaneGraph | None = None,
-        *,
-        deterministic: bool = True,
-    ) -> Prediction:
-        """Return lanes and topology of every decoder layer, from BEV features, traffic elements and prior tokens.
-
-        Sows the queries of every layer as `layer_queries` if the collection `intermediates` is mutable.
-        """
-        return decode_lanes(self, self.config.decoder, bev, elements, tokens or {}, lanes, deterministic)
-
     def decode_queries(self, start, bev, elements, tokens, deterministic) -> Prediction:
-        """Return the predictions of one set of queries; `start` as from `LaneQueries`."""
         config, spec, (queries, position, reference) = self.config.decoder, self.config.spec, start
         # No edges in the first layer.
         adjacency = jnp.zeros((config.queries, config.queries))

@@ -11,6 +11,10 @@ from tests.fast_compile import compile_fast
 
 compile_fast()
 
+# Workers and the commands that tests start read the modules as compiled before, whatever the environment says.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
+
 import jax  # noqa: E402
 import pytest  # noqa: E402
 from hypothesis import settings  # noqa: E402
@@ -28,7 +32,7 @@ else:
     atexit.register(shutil.rmtree, _programs, ignore_errors=True)
     os.environ["JAX_COMPILATION_CACHE_DIR"] = _programs
 jax.config.update("jax_compilation_cache_dir", _programs)
-jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
 # XLA reads its flags when JAX first asks for devices, which must not be inside a test that changes them.
 jax.devices()
 # No test survives a power failure: waiting for the device at every file costs a tenth of the tests that write.

@@ -9,6 +9,7 @@ import pytest
 
 from tests.models.images import HEIGHT, WIDTH, road_image, tiny_task
 from tests.parameters import random_params
+from tests.slow import with_slow
 from tflane_jax.errors import UserError
 from tflane_jax.export import export_model, image_program, latencies, load_program
 
@@ -28,7 +29,7 @@ def images(count):
     return np.random.default_rng(count).integers(0, 256, (count, HEIGHT, WIDTH, 3), np.uint8)
 
 
-@pytest.mark.parametrize("batch", [1, 3])
+@pytest.mark.parametrize("batch", with_slow([1, 3], quick=[3]))
 def test_exported_program_equals_the_model_for_any_batch_size(model, exported, batch):
     expected = jax.jit(image_program(*model))(images(batch))
     answer = load_program(exported).call(images(batch))

@@ -20,6 +20,7 @@ from tests.layers.test_graph_transformer import check as check_graph_transformer
 from tests.losses.test_costs import check_assignment
 from tests.models import test_bevformer_golden, test_sd_map_golden
 from tests.models.golden_bev import aligned, bev_config
+from tests.slow import with_slow
 from tflane_jax.convert.sd_map import SD_MAP_ENCODER
 from tflane_jax.models.sd_map_encoder import SdMapEncoder
 
@@ -148,6 +149,7 @@ def test_a_shift_along_the_axes_of_the_lidar_is_bevformers():
     assert np.abs(np.asarray(aligned(case, ego)[1]) - expected).max() > 0.01
 
 
+@pytest.mark.slow
 def test_a_map_encoder_without_categories():
     """Without weights for its category, a line is encoded as if it had none."""
     case = public("smerf_map_graph_transformer")
@@ -175,7 +177,7 @@ def test_a_map_encoder_without_categories():
     test_sd_map_golden.check_map_encoder(absent, "made here")
 
 
-@pytest.mark.parametrize("classes", [1, 3])
+@pytest.mark.parametrize("classes", with_slow([1, 3], quick=[3]))
 def test_an_assignment_with_normalised_truth_and_other_classes(classes):
     queries, lanes, points = 9, 4, 5
     low, high = np.array([-30.0, -15.0, -3.0]), np.array([30.0, 15.0, 2.0])

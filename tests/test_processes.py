@@ -69,6 +69,7 @@ print([event for event in asked if event.endswith(("/cache_hits", "/cache_misses
 """
 
 
+@pytest.mark.slow
 def test_joined_processes_read_and_keep_no_programs(tmp_path, monkeypatch):
     for name in [name for name in os.environ if name.startswith("JAX_COMPILATION") or "ENABLE_COMPILATION" in name]:
         monkeypatch.delenv(name)

@@ -14,8 +14,14 @@ from tests.slow import with_slow
 
 ROOT = Path(__file__).parents[1]
 HOSTS = {
-    "lane graphs": ["toponet, every prior"],
-    "further lane graphs": ["lanesegnet", "toponet", "toponet, cameras", "bevformer_detr", "lanesegnet, areas"],
+    "lane graphs": ["toponet"],
+    "further lane graphs": [
+        "toponet, every prior",
+        "lanesegnet",
+        "toponet, cameras",
+        "bevformer_detr",
+        "lanesegnet, areas",
+    ],
     "vector maps": ["maptr", "maptrv2"],
     "lane shapes": ["transformer", "gtn", "gcn", "han"],
 }

@@ -58,6 +58,7 @@ def test_a_declaration_is_written_first_and_kept(tiny, tmp_path, monkeypatch, ca
     assert json.loads((out / "declaration.json").read_text()) == declared
 
 
+@pytest.mark.slow
 def test_a_late_declaration_says_so_and_holds_for_these_configurations(tiny, tmp_path, capsys):
     assert compare(tiny, tmp_path, "01") == 0
     assert not (tmp_path / "effects.md").exists()
@@ -89,6 +90,7 @@ def test_mistakes_are_named_before_anything_is_trained(tiny, tmp_path, capsys, a
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_a_row_may_have_settings_of_its_own(tiny, tmp_path, capsys):
     matched = "matched={} --task.model.priors.traffic-flow.prior.top-instances 0"
     rows = ("base={}:baseline", "tfm={}", matched)
@@ -109,6 +111,7 @@ def test_a_row_may_have_settings_of_its_own(tiny, tmp_path, capsys):
     ]
 
 
+@pytest.mark.slow
 def test_declarations_of_an_earlier_form_name_one_treatment(tiny, tmp_path):
     assert compare(tiny, tmp_path, "01", *PRIMARY) == 0
     path = tmp_path / "declaration.json"

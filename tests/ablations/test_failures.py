@@ -200,6 +200,7 @@ def test_an_evaluation_that_fails_is_listed_too(tiny, tmp_path, monkeypatch, cap
     assert {row["model"] for row in rows(tmp_path / "table.md")} == {"base"}
 
 
+@pytest.mark.slow
 def test_test_sets_have_tables_of_their_own(tiny, tmp_path, capsys):
     tests = ["--test", "rain=--data.world.severity 1 --data.test 3", "--test", "Long Night=--data.test 4"]
     assert compare(tiny, tmp_path, "01", *tests) == 0

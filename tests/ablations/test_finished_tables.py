@@ -63,6 +63,7 @@ def test_runs_that_are_missing_are_named_and_the_others_count(tiny, trained, mon
     assert (last["tfm"], last["base"], last["again"]) == (2, 1, 1)
 
 
+@pytest.mark.slow
 def test_the_device_with_the_most_runs_is_taken(tiny, trained, monkeypatch):
     """Numbers of a CPU and of a GPU do not meet in a table."""
     compute_on(monkeypatch, "cpu: x")
@@ -72,6 +73,7 @@ def test_the_device_with_the_most_runs_is_taken(tiny, trained, monkeypatch):
     assert summary(trained)["seeds"] == [0, 1, 2]
 
 
+@pytest.mark.slow
 def test_a_run_without_its_parameters_counts_but_is_not_drawn(tiny, trained, monkeypatch, capsys):
     """Scores are small and parameters large: from a far machine one may fetch the scores alone."""
     for job in plan_table(small(tiny), range(3), trained).jobs["base"]:

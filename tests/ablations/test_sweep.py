@@ -28,6 +28,7 @@ def folder(tmp_path_factory):
     return root
 
 
+@pytest.mark.slow
 def test_every_run_is_evaluated_at_every_value(folder, tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("TFLANE_CACHE", str(tmp_path / "cache"))
     command = ["sweep", f"one={folder / 'one'}", str(folder / "other"), "--setting", "data.world.severity"]

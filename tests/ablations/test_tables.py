@@ -195,6 +195,7 @@ def test_a_table_that_was_stopped_ends_with_the_same_bytes(tiny, tmp_path, monke
         assert (parts / "paper.9" / name).read_bytes() == (whole / "paper.9" / name).read_bytes()
 
 
+@pytest.mark.slow
 def test_fewer_seeds_are_an_interim_look_and_equal_rows_are_trained_once(tiny, tmp_path):
     rows = (TableRow("base", f"{tiny}:baseline"), TableRow("tfm", str(tiny)), TableRow("same", str(tiny)))
     table = small(tiny, rows=rows, seeds=3)
@@ -236,6 +237,7 @@ def test_rows_start_from_hosts_of_their_seed(tiny, tmp_path):
         assert json.loads((Path(start) / "config.json").read_text())["training"]["seeds"] == seeds
 
 
+@pytest.mark.slow
 def test_no_row_starts_from_a_host_that_failed(tiny, tmp_path, monkeypatch, capsys):
     host = TableRow("host", f"{tiny}:baseline", ("--optim.lr", "0.1"))
     rows = (host, TableRow("base", f"{tiny}:baseline", start="host"), TableRow("alone", f"{tiny}:baseline"))
@@ -278,6 +280,7 @@ def test_a_table_with_more_steps_has_another_name_and_slower_schedules():
     assert main(["tables", "tf_lane.2", "--steps-factor", "0"]) == 2
 
 
+@pytest.mark.slow
 def test_a_quick_table_is_no_result(tiny, tmp_path, monkeypatch, capsys):
     run_table(small(tiny), range(2), tmp_path, quick=True)
     assert "6 runs, 0 complete; the others compile, train a few updates" in capsys.readouterr().out

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from tests.golden import golden_entries, load_module_case
+from tests.slow import with_slow
 from tflane_jax.convert.hosts import convert_host, load_host
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import BevGrid
@@ -185,7 +186,7 @@ CASES = {
 
 
 @pytest.mark.golden
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", with_slow(CASES, quick=["toponet", "maptrv2"]))
 def test_every_tensor_of_a_detector_has_its_place(name, tmp_path):
     model, make = CASES[name]
     state, path = make(), tmp_path / "weights.npz"

@@ -17,6 +17,7 @@ import pytest
 
 from tests.fakes import BrokenDataset, CrowdedDataset, DeadlyDataset, FakeConfig, FakeDataset, UnevenDataset
 from tests.shared import ROOT
+from tests.slow import with_slow
 from tflane_jax.datasets import cache, parallel
 from tflane_jax.datasets.base import TruncationWarning
 from tflane_jax.datasets.cache import CachedDataset, cache_root, cached, fingerprint
@@ -85,7 +86,7 @@ def test_configuration_and_code_are_part_of_the_name(tmp_path, monkeypatch):
     assert build(tmp_path, one).folder != folder
 
 
-@pytest.mark.parametrize("library", ["numpy", "scipy", "shapely", "opencv"])
+@pytest.mark.parametrize("library", with_slow(["numpy", "scipy", "shapely", "opencv"], quick=["numpy"]))
 def test_another_version_of_a_library_makes_other_examples(monkeypatch, library):
     """Images are drawn by OpenCV, road edges merged by shapely."""
     pytest.importorskip("cv2" if library == "opencv" else library)

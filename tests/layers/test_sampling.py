@@ -139,6 +139,7 @@ def test_non_finite_places_give_zero_and_finite_gradients(bad):
     assert np.isfinite(by_weight).all()
 
 
+@pytest.mark.slow
 def test_gradients_have_the_dtypes_of_what_they_belong_to():
     rng = np.random.default_rng(0)
     with jax.enable_x64(True):

@@ -130,6 +130,7 @@ def test_padding_after_the_last_valid_lane_of_a_batch_is_not_looked_at(valid):
     jax.tree.map(np.testing.assert_array_equal, whole, short)
 
 
+@pytest.mark.slow
 def test_a_batch_of_few_lanes_takes_few_rounds(monkeypatch):
     """Regression: the loop went over the padding, too."""
     rounds = []

@@ -10,6 +10,7 @@ from tests.golden import case_id, golden_modules, load_module_case
 from tests.golden_compare import assert_outputs_close, compare
 from tests.layers.batch_bugs import EXAMPLES, like_the_reference
 from tests.models.golden_bev import aligned, bev_config, golden_views, is_baseline, level_names, without_unused
+from tests.slow import with_slow
 from tflane_jax.convert.bevformer import BEV_CONSTRUCTER, ENCODER
 from tflane_jax.convert.renaming import check_fits, convert
 from tflane_jax.errors import UserError
@@ -19,7 +20,9 @@ from tflane_jax.models.bevformer import BevFormer, BevMemory, see_pillars
 pytestmark = pytest.mark.golden
 
 
-@pytest.mark.parametrize("path", golden_modules("bevformer_encoder*"), ids=case_id)
+@pytest.mark.parametrize(
+    "path", with_slow(golden_modules("bevformer_encoder*"), quick=["bevformer_encoder_1layer_prev"]), ids=case_id
+)
 def test_encoder_matches_the_reference(path):
     check_encoder(load_module_case(path))
 
@@ -48,7 +51,9 @@ def check_encoder(case):
     compare(case, outputs)
 
 
-@pytest.mark.parametrize("path", golden_modules("bev_constructer_*"), ids=case_id)
+@pytest.mark.parametrize(
+    "path", with_slow(golden_modules("bev_constructer_*"), quick=["bev_constructer_toponet_prev"]), ids=case_id
+)
 def test_constructer_matches_the_reference(path):
     check_constructer(load_module_case(path))
 

@@ -13,6 +13,7 @@ from jax import lax
 from tests.models.cases import CAMERA_DETR, CAMERA_TOPONET, make_camera_example, make_example
 from tests.parameters import random_params
 from tests.shared import assert_same
+from tests.slow import with_slow
 from tflane_jax.config import RunConfig, WorldData
 from tflane_jax.datasets.base import ExampleConfig
 from tflane_jax.errors import UserError
@@ -53,7 +54,7 @@ def fit(name):
     return Fitted(TASKS[name])
 
 
-@pytest.fixture(params=TASKS)
+@pytest.fixture(params=with_slow(TASKS, quick=["toponet"]))
 def fitted(request):
     return fit(request.param)
 
@@ -160,6 +161,7 @@ def test_loss_reports_every_term_for_any_number_of_targets(toponet):
     assert toponet.train._cache_size() == 1
 
 
+@pytest.mark.slow
 def test_every_parameter_of_a_part_learns(toponet):
     batch = batch_of(make_camera_example(6), make_camera_example(7))
     gradient = toponet.train(toponet.params, batch, jax.random.key(0))[1]

@@ -268,6 +268,7 @@ def test_small_maps(name, shape):
     assert np.isfinite(out).all()
 
 
+@pytest.mark.slow
 def test_the_weights_of_meta_paths_do_not_depend_on_the_number_of_cells():
     """Semantic attention is over the mean of all cells (Eq. 7): a map repeated in rows and columns has the same."""
     module = HeterogeneousAttention(HanEncoderConfig(semantic=8, relations=("row", "column")))

@@ -167,7 +167,7 @@ def test_loss_is_traced_once_and_its_gradient_is_finite(name):
         assert all(not np.asarray(g).any() for g in jax.tree.leaves(silent))
 
 
-@pytest.mark.parametrize("name", QUICK)
+@pytest.mark.parametrize("name", with_slow(QUICK, quick=["traffic"]))
 def test_same_key_same_parameters(name):
     # Each task is traced anew. Equal programs give equal numbers: nothing needs to be compiled.
     inits = (jax.jit(make_task(MODELS[name]).init) for _ in range(2))

@@ -89,6 +89,7 @@ def test_published_layers_start_xavier_uniform_and_the_rest_as_it_is():
     assert not np.array_equal(flat["layer_0/feed_forward/expand/kernel"], flat["layer_1/feed_forward/expand/kernel"])
 
 
+@pytest.mark.slow
 def test_heads_start_as_copies_of_one_another():
     module = replace(SEGMENTS, decoder=replace(SEGMENTS.decoder, layers=2)).build()
     params = jax.jit(lambda key: module.init(key, BEV, method=LaneSegNet.decode))(jax.random.key(1))["params"]
@@ -194,6 +195,7 @@ def test_areas_are_predicted_apart_and_segments_have_one_class():
     assert found.segments.areas.logits.shape == (2, 4, 2)
 
 
+@pytest.mark.slow
 def test_the_published_fault_of_the_areas_changes_their_points_alone():
     """Points are the raw change scaled to the range; references, and with them all else, are refined as meant."""
     meant, raw = (replace(BUCKET, areas=replace(AREAS, output=output)).build() for output in ("sigmoid", "raw"))

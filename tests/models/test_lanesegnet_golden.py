@@ -9,6 +9,7 @@ from tests.golden import case_id, golden_modules, implemented, load_module_case
 from tests.golden_compare import compare
 from tests.models.golden_lanes import bev_maps, by_layer, encoder_config, queries_of
 from tests.models.golden_segments import decoder_config, segments_by_name, targets
+from tests.slow import with_slow
 from tflane_jax.convert.lanesegnet import LANESEGNET_HEAD
 from tflane_jax.layers.graph import RelationshipHead
 from tflane_jax.losses.lanesegnet import LaneSegNetLossConfig, assign_segments, matching_cost, segment_losses
@@ -24,7 +25,7 @@ LOSSES = {
 
 
 @pytest.mark.golden
-@pytest.mark.parametrize("path", golden_modules("laneseg_head_*"), ids=case_id)
+@pytest.mark.parametrize("path", with_slow(golden_modules("laneseg_head_*"), quick=["laneseg_head_train"]), ids=case_id)
 def test_head_matches_the_reference(path):
     check_head(load_module_case(path))
 

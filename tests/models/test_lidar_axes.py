@@ -106,6 +106,7 @@ def test_ranges_and_rasters_turn_as_points_do():
     np.testing.assert_array_equal(raster_in_ego_axes(jnp.asarray(theirs)), ours)
 
 
+@pytest.mark.slow
 def test_the_road_users_ahead_come_first_in_either_axes():
     """More road users than slots: those in the front sector stay, whichever way the axes point."""
     lidar = range_in_lidar_axes(RANGE)
@@ -180,6 +181,7 @@ def test_the_truth_of_the_image_masks_lies_in_the_lidars_plane():
         jax.tree.map(np.testing.assert_array_equal, kept, lines)
 
 
+@pytest.mark.slow
 def test_the_loss_draws_image_masks_in_the_lidars_plane():
     """A head that knows the masks in that plane has less loss than one that knows those on level ground."""
     lines, example = some_lines(), make_example()

@@ -67,6 +67,7 @@ def test_every_layer_moves_the_points_of_the_layer_before(params):
     np.testing.assert_allclose(moved, np.stack([unit, unit]), atol=1e-4)
 
 
+@pytest.mark.slow
 def test_heads_start_as_copies_of_one_another_and_classes_are_rare():
     module = replace(LINES, decoder=replace(LINES.decoder, layers=3)).build()
     params = jax.jit(lambda key: module.init(key, BEV, method=MapTr.decode))(jax.random.key(1))["params"]
@@ -76,6 +77,7 @@ def test_heads_start_as_copies_of_one_another_and_classes_are_rare():
     assert 0.9 < np.std(params["queries"]["instances"]) < 1.1
 
 
+@pytest.mark.slow
 def test_lines_of_the_small_form_start_in_the_range_and_end_at_its_border():
     config = replace(SMALL_LINES, range=PerceptionRange((-30.0, 30.0), (-15.0, 15.0)), priors=PriorsConfig())
     module = config.build()

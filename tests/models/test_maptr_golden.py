@@ -18,6 +18,7 @@ from tests.models.golden_maps import (
     perception_range,
     targets,
 )
+from tests.slow import with_slow
 from tflane_jax.convert.maptr import MAPTR_HEAD
 from tflane_jax.evaluation.vector_maps import detections_of_lines
 from tflane_jax.losses.maptr import MapTrLossConfig, assign_lines, line_losses, matching_cost
@@ -26,7 +27,7 @@ from tflane_jax.models.maptr import MapTr, MapTrConfig
 
 
 @pytest.mark.golden
-@pytest.mark.parametrize("path", golden_modules("maptr_head_*"), ids=case_id)
+@pytest.mark.parametrize("path", with_slow(golden_modules("maptr_head_*"), quick=["maptr_head_gkt"]), ids=case_id)
 def test_head_matches_the_reference(path):
     check_head(load_module_case(path))
 

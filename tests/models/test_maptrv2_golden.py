@@ -10,6 +10,7 @@ from tests.golden import case_id, golden_modules, implemented, load_module_case,
 from tests.golden_compare import compare
 from tests.models.golden_lanes import by_layer
 from tests.models.golden_maps import decoder_config, lines_by_name, perception_range, targets
+from tests.slow import with_slow
 from tflane_jax.convert.maptr import MAPTRV2_HEAD
 from tflane_jax.losses.maptr import assign_lines, line_losses, matching_cost
 from tflane_jax.losses.maptrv2 import MapTrV2LossConfig, mask_loss, one_to_many_losses
@@ -19,7 +20,7 @@ from tflane_jax.models.maptrv2 import MapTrV2, MapTrV2Config
 
 
 @pytest.mark.golden
-@pytest.mark.parametrize("path", golden_modules("maptrv2_head_*"), ids=case_id)
+@pytest.mark.parametrize("path", with_slow(golden_modules("maptrv2_head_*"), quick=["maptrv2_head_train"]), ids=case_id)
 def test_head_matches_the_reference(path):
     check_head(load_module_case(path))
 

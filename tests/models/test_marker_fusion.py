@@ -87,6 +87,7 @@ def without_markers(params):
     return {name: without_markers(value) for name, value in params.items() if not name.startswith("marker")}
 
 
+@pytest.mark.slow
 def test_without_markers_in_sight_the_host_is_unchanged(params, step):
     expected = jax.jit(PLAIN.step)(without_markers(params), PLAIN.start(), make_example(0))[1]
     for markers in (None, observed(valid=False), observed(valid=False, garbage=np.nan), observed(lanes=0)):

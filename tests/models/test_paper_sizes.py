@@ -51,6 +51,7 @@ def test_toponet_is_as_large_as_the_reference():
     assert answer.elements.lane_logits.shape == (6, 200, 100)
 
 
+@pytest.mark.slow
 def test_lanesegnet_is_as_large_as_the_reference():
     config = lanesegnet.paper_config()
     module, example = config.build(), camera_shapes(config.encoder)

@@ -73,7 +73,7 @@ def test_what_a_new_prior_demands_is_checked_by_every_host(name, width, rule):
         host.build()
 
 
-@pytest.mark.parametrize("name", with_slow(HOSTS, quick=("toponet", "detr")))
+@pytest.mark.parametrize("name", with_slow(HOSTS, quick=("toponet",)))
 def test_a_new_prior_plugs_into_every_host_by_both_hooks(name):
     host, make = HOSTS[name]
     task = LaneGraphTask(replace(host, priors=WithToy(traffic_flow=FLOW, crossings=CrossingsConfig())))

@@ -11,6 +11,7 @@ import pytest
 from tests.models.cases import BASELINE, make_example
 from tests.models.test_bevformer import CONFIG, levels, ring
 from tests.parameters import random_params
+from tests.slow import with_slow
 from tflane_jax.geometry import BevGrid, PerceptionRange
 from tflane_jax.layers.polyline_encoder import (
     MARKER_POLYLINES,
@@ -107,7 +108,7 @@ def test_sizes_of_a_map(attend, lines):
     assert np.isfinite(out).all()
 
 
-@pytest.mark.parametrize("absent", ["nothing", "reference"])
+@pytest.mark.parametrize("absent", with_slow(["nothing", "reference"], quick=["reference"]))
 @pytest.mark.parametrize("lines", [0, 3])
 def test_a_map_without_lines_changes_no_feature(absent, lines):
     rng = np.random.default_rng(1)

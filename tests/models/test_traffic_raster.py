@@ -121,6 +121,7 @@ def test_layers(layers, count):
     assert not any(name.startswith("spatial_encoder") for name in params)
 
 
+@pytest.mark.slow
 def test_training_reaches_the_parameters():
     task = LaneGraphTask(with_flow(BASELINE, BOTH))
     examples = [make_example(0), without_flow(make_example(1))]

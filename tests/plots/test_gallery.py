@@ -37,6 +37,7 @@ def test_sizes_that_do_not_fit_are_named(tmp_path):
         save_examples(tmp_path / "a.png", EXAMPLES, titles=["only one"])
 
 
+@pytest.mark.slow
 def test_many_models_take_further_lines(tmp_path):
     one_line, two_lines = (
         imread(save_examples(tmp_path / f"{count}.png", EXAMPLES, {f"{n}": PREDICTIONS for n in range(count)})).shape

@@ -210,6 +210,7 @@ def test_the_matched_control_differs_from_the_treatment_by_the_traffic_alone():
     assert all(learning.values())
 
 
+@pytest.mark.slow
 def test_queries_only_is_the_model_without_the_raster():
     traffic = WITH_TRAFFIC.priors.traffic_flow
     both = replace(

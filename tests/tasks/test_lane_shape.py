@@ -115,6 +115,7 @@ def test_an_image_of_nothing_but_padding_stays_finite(fitted):
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((numbers(state), metrics)))
 
 
+@pytest.mark.slow
 def test_training_changes_every_learned_parameter_and_the_statistics(fitted):
     batch = jax.device_put(road_images(2))
     state, losses = fitted.start(), []

@@ -92,6 +92,7 @@ def test_evaluation_streams_through_scenes(params, batch_size):
     assert differs == [False, True, True] * 2
 
 
+@pytest.mark.slow
 def test_single_frames_of_a_stream_are_drawn_with_memory(params):
     frames = scenes()
     each = [jax.tree.map(lambda leaf, i=i: leaf[i], frames) for i in range(6)]

@@ -240,6 +240,7 @@ def test_a_part_of_a_bent_lane_ends_where_its_length_says():
     assert np.linalg.norm(across, axis=-1) == pytest.approx(3.6, abs=0.01)
 
 
+@pytest.mark.slow
 def test_scenes_of_real_like_have_them_and_their_mirror_images_too():
     found = 0
     for scene in range(8):

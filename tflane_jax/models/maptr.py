@@ -14,8 +14,9 @@ from typing import Any, ClassVar, Literal
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from tflane_jax.geometry import BevGrid, PerceptionRange
 from tflane_jax.layers.fpn import FeaturePyramidConfig
@@ -221,20 +222,57 @@ class MapTr(Host):
             tokens: of the priors, by name.
             deterministic: no dropout.
         """
-        config, spec, (content, position, reference) = self.config.decoder, self.config.spec, start
-        queries, outputs = content.reshape(-1, config.dim), []
+        config, spec, (queries, position, reference) = self.config.decoder, self.config.spec, start
+        (lines, points, dim), groups, outputs = queries.shape, self.groups(len(queries)), []
+        apart, sizes = same_group(groups), tuple(count * points for count in groups)
+        apart_by_point = None if apart is None else jnp.asarray(np.kron(apart, np.ones((points, points), bool)))
         for i in range(config.layers):
-            placed = point_position(config, i, position, reference).reshape(-1, config.dim)
-            points = HostQueries(queries, placed, reference.reshape(len(queries), 1, -1))
-            queries = fuse_into_queries(self.priors.by_name, tokens, i, points)
-            # Attention among all I P queries, then to the BEV features around each point.
-            around = reference[..., :2].reshape(-1, 1, 2)
-            layer, inputs = partial(LaneDecoderLayer, config, name=f"layer_{i}"), (queries, placed, around, bev, None)
-            queries = run_layer(self, layer, config, *inputs, deterministic=deterministic)
+            placed = point_position(config, i, position, reference)
+            spots = reference.reshape(lines * points, 1, -1)
+            flat = HostQueries(queries.reshape(-1, dim), placed.reshape(-1, dim), spots, apart_by_point, sizes)
+            queries = fuse_into_queries(self.priors.by_name, tokens, i, flat).reshape(queries.shape)
+            queries = self.attend(i, queries, placed, reference, bev, apart, deterministic)
             heads = LineHeads(config, spec.bev_range, spec.range, name=f"heads_{i}")
-            outputs.append(heads(queries.reshape(content.shape), reference))
+            outputs.append(heads(queries, reference))
             reference = lax.stop_gradient(outputs[-1].unit)
         return make_prediction(outputs)
+
+    def groups(self, lines: int) -> tuple[int, ...]:
+        """Return the numbers of lines, of so many in all, in groups that exchange nothing; () for a single group."""
+        return ()
+
+    def attend(
+        self,
+        layer: int,
+        queries: Float[Array, "i p c"],
+        placed: Float[Array, "i p c"],
+        reference: Float[Array, "i p d"],
+        bev: Float[Array, "h w e"],
+        apart: Bool[np.ndarray, "i i"] | None,
+        deterministic: bool,
+    ) -> Float[Array, "i p c"]:
+        """Return the queries after a decoder layer: attention among all points, then to the BEV features around each.
+
+        Args:
+            layer: its number.
+            queries, placed: content of the queries and the position encoding added to it.
+            reference: points in [0, 1].
+            bev: BEV features.
+            apart: which line may attend to which; None: all to all.
+            deterministic: no dropout.
+        """
+        config = self.config.decoder
+        module = partial(LaneDecoderLayer, config, name=f"layer_{layer}")
+        flat = queries.reshape(-1, config.dim), placed.reshape(-1, config.dim), reference[..., :2].reshape(-1, 1, 2)
+        return run_layer(self, module, config, *flat, bev, None, deterministic=deterministic).reshape(queries.shape)
+
+
+def same_group(groups: tuple[int, ...]) -> Bool[np.ndarray, "i i"] | None:
+    """Return which of the members of groups, one group after the other, are in the same one; None without groups."""
+    if not groups:
+        return None
+    number = np.repeat(np.arange(len(groups)), groups)
+    return number[:, None] == number
 
 
 def turned(prediction: Prediction, level: Float[Array, "4 4"] | None) -> Prediction:

@@ -13,8 +13,6 @@ from functools import partial
 
 import flax.linen as nn
 import jax
-import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from tflane_jax.layers.attention import MultiHeadAttention
@@ -30,14 +28,10 @@ from tflane_jax.models.lift import LiftConfig
 from tflane_jax.models.map_lines import (
     PAPER_LINE_DECODER,
     LineDecoderConfig,
-    LineHeads,
     LineQueries,
-    PointQueries,
-    point_position,
 )
-from tflane_jax.models.maptr import PAPER_MAP_ENCODER, PAPER_RANGE, MapTr, MapTrConfig, make_prediction, turned
-from tflane_jax.models.prior import HostQueries
-from tflane_jax.models.priors import ByPrior, fuse_into_queries
+from tflane_jax.models.maptr import PAPER_MAP_ENCODER, PAPER_RANGE, MapTr, MapTrConfig, turned
+from tflane_jax.models.priors import ByPrior
 from tflane_jax.scene import MapLines, Prediction
 
 
@@ -126,36 +120,19 @@ class MapTrV2(MapTr):
             self.sow(AUXILIARY, "one_to_many", jax.tree.map(lambda leaf: leaf[:, count:], found.lines))
         return jax.tree.map(lambda leaf: leaf[:, :count], found)
 
-    def decode_queries(
-        self, start: PointQueries, bev: Float[Array, "h w e"], elements: None, tokens: ByPrior, deterministic: bool
-    ) -> Prediction:
-        """Return the predictions of one set of queries; those of the one-to-many group exchange nothing with others.
+    def groups(self, lines: int) -> tuple[int, ...]:
+        """Return the numbers of lines of the one-to-one and the one-to-many group; () without the second."""
+        first = self.config.decoder.queries
+        return (first, lines - first) if lines > first else ()
 
-        Args:
-            start: I lines of P points, those of the one-to-many group last: content and position (I, P, C), points
-                (I, P, D) in [0, 1].
-            bev, elements, tokens, deterministic: see `MapTr.decode_queries`.
-        """
-        config, spec, (queries, position, reference) = self.config.decoder, self.config.spec, start
-        (lines, points, dim), outputs = queries.shape, []
-        groups, sizes = None, ()
-        if lines > config.queries:
-            sizes = config.queries * points, (lines - config.queries) * points
-            many = jnp.arange(lines) >= config.queries
-            groups = many[:, None] == many[None]
-        every = None if groups is None else jnp.repeat(jnp.repeat(groups, points, 0), points, 1)
-        for i in range(config.layers):
-            placed = point_position(config, i, position, reference)
-            points_alone = reference.reshape(-1, 1, reference.shape[-1])
-            flat = HostQueries(queries.reshape(-1, dim), placed.reshape(-1, dim), points_alone, every, sizes)
-            queries = fuse_into_queries(self.priors.by_name, tokens, i, flat).reshape(queries.shape)
-            layer = partial(DecoupledLayer, config, name=f"layer_{i}")
-            inputs = queries, placed, reference, bev, groups
-            queries = run_layer(self, layer, config, *inputs, deterministic=deterministic)
-            heads = LineHeads(config, spec.bev_range, spec.range, name=f"heads_{i}")
-            outputs.append(heads(queries, reference))
-            reference = lax.stop_gradient(outputs[-1].unit)
-        return make_prediction(outputs)
+    def attend(self, layer, queries, placed, reference, bev, apart, deterministic):
+        """Return the queries after a decoder layer of decoupled attention; see `MapTr.attend`."""
+        config = self.config.decoder
+        module, inputs = (
+            partial(DecoupledLayer, config, name=f"layer_{layer}"),
+            (queries, placed, reference, bev, apart),
+        )
+        return run_layer(self, module, config, *inputs, deterministic=deterministic)
 
 
 class DecoupledLayer(nn.Module):

@@ -71,3 +71,20 @@ def test_a_device_whose_memory_is_full_is_one_line(full, monkeypatch, capsys):
     with contextlib.nullcontext() if full else pytest.raises(RuntimeError, match="INTERNAL"):
         assert main(["cache", "list"]) == 2
         assert capsys.readouterr().err.startswith("tflane: the memory of the device is full: a smaller training.")
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "predict no_run",
+        "markers run --store no_store --poses no_poses --images no_images",
+        "markers detect no_photo --intrinsics 1 1 1 1",
+        "markers render --log 0",
+    ],
+)
+def test_where_results_go_is_checked_before_anything_is_read(command, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").write_text("")
+    assert main([*command.split(), "--out", "file/out"]) == 2
+    said = capsys.readouterr().err
+    assert said == f"tflane: cannot write file/out: {tmp_path}/file is no folder; choose another path\n"

@@ -35,7 +35,7 @@ from tflane_jax.datasets.marker_cache import search_views
 from tflane_jax.datasets.marker_observations import store_of_log
 from tflane_jax.datasets.native_views import fitted_views
 from tflane_jax.errors import UserError
-from tflane_jax.files.atomic import write_bytes, write_json
+from tflane_jax.files.atomic import check_folder, write_bytes, write_json
 from tflane_jax.files.images import opencv
 from tflane_jax.geometry import PerceptionRange, invert_pose
 from tflane_jax.markers.image_search import DetectorConfig
@@ -68,6 +68,7 @@ def run(options: argparse.Namespace) -> int:
     if not 0.0 <= options.threshold <= 1.0:
         raise UserError(f"--threshold {options.threshold:g}: it must be a score from 0 to 1")
     configure_jax()
+    check_folder(options.out)
     opencv()  # without it, every image would be a fault
     store, drive = load_store(options.store), load_drive(options.poses, options.images)
     if options.interval is not None:
@@ -253,6 +254,7 @@ def render(options: argparse.Namespace) -> int:
     if not 1 <= options.cameras <= len(ring):
         raise UserError(f"--cameras is 1 to {len(ring)}, the cameras of --ring {options.ring}, not {options.cameras}")
     boards = PlacementConfig(side="both", site="clear")
+    check_folder(options.out)
     # Two seconds of history come before the first frame.
     world = WorldConfig(duration_s=1.6 + 0.5 * options.frames, keyframes=options.frames, markers=boards)
     log = simulate(options.log, world)

@@ -25,7 +25,7 @@ from jaxtyping import Float, UInt8
 
 from tflane_jax.commands.sources import make_folder
 from tflane_jax.errors import UserError
-from tflane_jax.files.atomic import write_bytes, write_json
+from tflane_jax.files.atomic import check_folder, write_bytes, write_json
 from tflane_jax.files.images import check_centre, list_photos, opencv, read_image, undistorted
 from tflane_jax.geometry.cameras import project
 from tflane_jax.limits import check_settings
@@ -49,6 +49,7 @@ def find(options: argparse.Namespace) -> int:
     A photo that cannot be read, or that the intrinsics do not fit, is recorded and told, the others are searched, and
     the result is 2.
     """
+    check_folder(options.out)
     opencv()  # without it, every photo would be a fault
     photos = list_photos(options.images)
     config = DetectorConfig(

@@ -8,6 +8,7 @@ from pathlib import Path
 from tflane_jax.commands import predict_images, predict_lanes, predict_photos
 from tflane_jax.commands.sources import opened
 from tflane_jax.errors import UserError
+from tflane_jax.files.atomic import check_folder
 from tflane_jax.tasks.lane_shape import LaneShapeTask
 from tflane_jax.training.runtime import configure_jax
 
@@ -20,6 +21,7 @@ _OF_PHOTOS = "is of photos: name some, or leave it out"
 def run(options: argparse.Namespace) -> int:
     """Predict with the first seed, and write all files to --out."""
     configure_jax()
+    check_folder(options.out)  # before the weights are read and examples made
     if options.threshold is not None and not 0.0 <= options.threshold <= 1.0:
         raise UserError(f"--threshold {options.threshold:g}: it must be a score from 0 to 1")
     trained, photos = opened(options)

@@ -14,6 +14,7 @@ from tflane_jax.datasets.base import SPLITS, Split
 from tflane_jax.datasets.data_source import Choice, DataSource
 from tflane_jax.datasets.sources import SOURCES, named_source, source_name, source_names, source_of
 from tflane_jax.errors import UserError
+from tflane_jax.files.folders import named_folder
 from tflane_jax.models.host import HostConfig
 from tflane_jax.run_checks import EXAMPLE_NAMES, check_kind
 from tflane_jax.runs import Run, open_run, open_weights
@@ -117,7 +118,9 @@ def chosen_source(config: RunConfig, options: argparse.Namespace, split: Split |
     if options.data is None and options.root is None:
         return configured
     _check_choice(source, kind, options)
-    root, openlane = (None if path is None else Path(path) for path in (options.root, options.openlane))
+    # The name of a folder may be that of a split.
+    root = None if options.root is None else named_folder(options.root)
+    openlane = None if options.openlane is None else Path(options.openlane)
     return source.choose(Choice(chosen, given is not None, configured, root, openlane, option))
 
 

@@ -266,8 +266,9 @@ def _tracks(
     unknown = [n for n in names if n not in categories]
     if unknown:
         raise UserError(
-            f"{folder / ANNOTATIONS} has the unknown category {', '.join(unknown)}: "
-            "add it to `categories` with its road user"
+            f"{folder / ANNOTATIONS} has the unknown category {', '.join(unknown)}: rename it there to a known one, "
+            "such as REGULAR_VEHICLE, or add it with its road user to CATEGORIES of "
+            "tflane_jax/datasets/argoverse2_log.py"
         )
     traffic = np.isin(category_row, [i for i, n in enumerate(names) if categories[n] is not None])
     boxes = {name: column[traffic] for name, column in boxes.items()}

@@ -24,6 +24,8 @@ def check_nuscenes(root: Path) -> FolderCheck:
     faults: list[str] = []
     maps: dict[str, MapExpansion | None] = {}
     counts: dict[str, Counter[str]] = {}
+    if not tables.scenes():
+        faults.append(f"{tables.folder / 'scene.json'} holds no scene: unpack the tables again")
     for name, scene in sorted(tables.scenes().items()):
         location = tables.location(scene)
         if location not in maps:

@@ -23,6 +23,7 @@ from tflane_jax.datasets.plausible import FARTHEST, MOST_PIXELS
 from tflane_jax.errors import UserError
 from tflane_jax.files.fields import file_within, is_time, items, load_json, load_members, member, numbers
 from tflane_jax.files.openlane import CENTERLINE, SEGMENT, FrameKey
+from tflane_jax.files.wording import shown
 from tflane_jax.geometry import pose_matrix
 
 SubsetName = Literal["A", "B"]
@@ -245,6 +246,8 @@ def source_logs(root: Path, keys: Sequence[FrameKey], suffix: str = "") -> dict[
             path = info_path(root, key, suffix)
             meta = member(load_members(path, ("meta_data",)), "meta_data", str(path))
             log = member(meta, "source_id", f"{path}: meta_data")
+            if not isinstance(log, str | int) or log == "":
+                raise UserError(f"{path}: meta_data.source_id is {shown(log)}, expected the name of the source log")
             logs[key.split, key.segment] = str(log)
     return logs
 

@@ -309,4 +309,5 @@ SOURCE = DataSource(
     views=_views,
     interval=lambda config: 0.5,
     cameras=lambda config: None if config.image is None else CAMERAS,
+    tracks_hz=lambda config: 2.0,
 )

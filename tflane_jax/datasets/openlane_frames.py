@@ -41,6 +41,7 @@ class Subset:
         tick_ns: unit of the timestamps, nanoseconds.
         first_segment: number of the first segment of each split.
         data_dict: name of the split file.
+        tracks_hz: frames a second of the boxes in the source logs.
     """
 
     cameras: tuple[str, ...]
@@ -48,6 +49,7 @@ class Subset:
     tick_ns: int
     first_segment: Mapping[Split, int]
     data_dict: str
+    tracks_hz: float
 
 
 SUBSETS: Mapping[SubsetName, Subset] = {
@@ -65,6 +67,7 @@ SUBSETS: Mapping[SubsetName, Subset] = {
         tick_ns=1,
         first_segment={"train": 0, "val": 10_000, "test": 20_000},
         data_dict="data_dict_subset_A.json",
+        tracks_hz=10.0,
     ),
     "B": Subset(
         cameras=("CAM_FRONT", "CAM_FRONT_RIGHT", "CAM_FRONT_LEFT", "CAM_BACK", "CAM_BACK_LEFT", "CAM_BACK_RIGHT"),
@@ -72,6 +75,7 @@ SUBSETS: Mapping[SubsetName, Subset] = {
         tick_ns=1000,
         first_segment={"train": 1000, "val": 11_000, "test": 21_000},
         data_dict="data_dict_subset_B.json",
+        tracks_hz=2.0,
     ),
 }
 

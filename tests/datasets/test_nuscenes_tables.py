@@ -270,3 +270,15 @@ def test_tables_without_a_scene_are_a_fault(tmp_path):
     found = check_nuscenes(write_nuscenes(tmp_path, content))
     assert found.rows == []
     assert [fault.partition("scene.json ")[2] for fault in found.faults] == ["holds no scene: unpack the tables again"]
+
+
+def test_a_folder_of_tables_and_maps_alone_is_sound(tmp_path):
+    """Regression: every scene was a fault, though models that see no images need none."""
+    found = check_nuscenes(write_nuscenes(tmp_path))
+    assert (found.faults, [row["missing images"] for row in found.rows]) == ([], [0, 0])
+    assert found.skipped == [f"images were not looked for: there is no {tmp_path / 'samples'}"]
+    (tmp_path / "samples").mkdir()
+    assert [fault.partition(" images")[0] for fault in check_nuscenes(tmp_path).faults] == [
+        "scene-0061: 4",
+        "scene-0103: 2",
+    ]

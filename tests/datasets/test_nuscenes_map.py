@@ -134,6 +134,7 @@ def edit(*keys, value):
     ("damage", "message"),
     [
         (edit("version", value="1.2"), "is version '1.2', which has no arclines: download version 1.3"),
+        (edit("version", value=...), "names no version, as the first ones do, .*: download version 1.3"),
         (edit("version", value="1." + 5000 * "3"), "is version '1.3+, which has no arclines: download version 1.3"),
         *(
             (edit(layer, value=...), f"lacks the entry '{layer}'")

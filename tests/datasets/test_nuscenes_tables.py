@@ -5,6 +5,7 @@ import json
 import pytest
 
 from tests.datasets.nuscenes_small import START, tables, write_nuscenes
+from tflane_jax.datasets.nuscenes_check import check_nuscenes
 from tflane_jax.datasets.nuscenes_log import scene_frames, scene_tracks
 from tflane_jax.datasets.nuscenes_splits import MINI_TRAIN, MINI_VAL, TEST, VAL, official_split, split_scenes
 from tflane_jax.datasets.nuscenes_tables import TABLES, find_tables, read_tables
@@ -173,7 +174,10 @@ DAMAGE = {
     "zero quaternion of a box": (change("sample_annotation", 1, rotation=ZERO), "row car-0: rotation .* no unit quat"),
     "negative size": (change("sample_annotation", 1, size=[2.0, -4.0, 1.0]), r"row car-0: size \[2.0, -4.0, 1.0\]"),
     "size of two": (change("sample_annotation", 1, size=[2.0, 4.0]), r"row car-0: size has shape \(2,\)"),
-    "category nobody knows": (change("category", 0, name="hovercraft"), "unknown category 'hovercraft'"),
+    "category nobody knows": (
+        change("category", 0, name="hovercraft"),
+        "unknown category 'hovercraft': name it below a known one there, such as vehicle.car.hovercraft, or add it to",
+    ),
     "vehicle nobody knows": (change("category", 0, name="vehicle.hovercraft"), "unknown category 'vehicle.hovercraft'"),
     "instance twice in a sample": (
         repeat("sample_annotation", token="again"),
@@ -258,3 +262,23 @@ def test_splits_of_a_users_own(tmp_path):
         file.write_text(json.dumps(wrong))
         with pytest.raises(UserError, match=r"splits\.json"):
             split_scenes(names, "train", mini=True, file=file)
+
+
+def test_tables_without_a_scene_are_a_fault(tmp_path):
+    """Regression: `data check` found nothing wrong with an empty table."""
+    content = {name: rows if name == "category" else [] for name, rows in tables().items()}
+    found = check_nuscenes(write_nuscenes(tmp_path, content))
+    assert found.rows == []
+    assert [fault.partition("scene.json ")[2] for fault in found.faults] == ["holds no scene: unpack the tables again"]
+
+
+def test_a_folder_of_tables_and_maps_alone_is_sound(tmp_path):
+    """Regression: every scene was a fault, though models that see no images need none."""
+    found = check_nuscenes(write_nuscenes(tmp_path))
+    assert (found.faults, [row["missing images"] for row in found.rows]) == ([], [0, 0])
+    assert found.skipped == [f"images were not looked for: there is no {tmp_path / 'samples'}"]
+    (tmp_path / "samples").mkdir()
+    assert [fault.partition(" images")[0] for fault in check_nuscenes(tmp_path).faults] == [
+        "scene-0061: 4",
+        "scene-0103: 2",
+    ]

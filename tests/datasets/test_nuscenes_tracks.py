@@ -1,15 +1,21 @@
 """Tracks of nuScenes for frames of another data set, at its own times and poses."""
 
+import pickle
 import shutil
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from time import sleep
 
 import numpy as np
 import pytest
 
 from tests.datasets.nuscenes_small import PITCH, write_nuscenes
+from tests.datasets.small_argoverse2 import write_log
+from tflane_jax.datasets import nuscenes_tracks, openlane_tracks
 from tflane_jax.datasets.examples import traffic_flow
 from tflane_jax.datasets.nuscenes_log import level_poses
 from tflane_jax.datasets.nuscenes_tracks import SceneTracks
+from tflane_jax.datasets.openlane_tracks import SourceTracks
 from tflane_jax.errors import UserError
 from tflane_jax.scene.logs import KeyFrame
 
@@ -40,3 +46,29 @@ def test_a_frame_of_its_own_pose_gets_the_history(tmp_path):
     assert dropped == 0
     car = int(np.flatnonzero(flow.valid[:, 17])[0])
     np.testing.assert_allclose(flow.position[car, 17], [-5.1, 3.0, 1.0], atol=1e-5)
+
+
+@pytest.mark.parametrize("subset", ["A", "B"])
+def test_threads_read_a_log_once_and_a_copy_for_a_worker_keeps_none(tmp_path, monkeypatch, subset):
+    """Regression: every thread of a loader that asked for a log at once read it, and copies held all logs so far."""
+    if subset == "A":
+        pytest.importorskip("pyarrow")
+        write_log(tmp_path / "log-a")
+        module, reader, name = openlane_tracks, "load_log", "log-a"
+    else:
+        write_nuscenes(tmp_path)
+        module, reader, name = nuscenes_tracks, "scene_log", "scene-0061"
+    tracks = SourceTracks(tmp_path, subset, {})
+    before, read, made = len(pickle.dumps(tracks)), getattr(module, reader), []
+
+    def slowly(*args, **kwargs):
+        made.append(1)
+        sleep(0.1)
+        return read(*args, **kwargs)
+
+    monkeypatch.setattr(module, reader, slowly)
+    with ThreadPoolExecutor(4) as threads:
+        logs = list(threads.map(tracks._logs.log, [name] * 4))
+    assert (len(made), {id(log) for log in logs}) == (1, {id(logs[0])})
+    assert len(pickle.dumps(tracks)) == before
+    assert pickle.loads(pickle.dumps(tracks))._logs.log(name).name == name

@@ -217,6 +217,25 @@ def test_the_check_counts_frames_with_traffic(written, capsys):
     assert main(["data", "check", "--format", "tusimple", str(frames), "--tracks", str(tracks)]) == 2
 
 
+@pytest.mark.parametrize("source", [None, ..., ""])
+def test_a_segment_that_does_not_name_its_log_is_a_fault(written, tmp_path, source):
+    """Regression: `data check` found nothing wrong, where training stopped."""
+    frames, tracks = Path(shutil.copytree(written[0], tmp_path / "frames")), written[1]
+    first = sorted(frames.glob("val/*/info/*[0-9].json"))[0]
+    record = json.loads(first.read_text())
+    record["meta_data"] |= {"source_id": source}
+    if source is ...:
+        del record["meta_data"]["source_id"]
+    first.write_text(json.dumps(record))
+    with pytest.raises(UserError, match="source_id") as error:
+        opened(frames, tracks)
+    found = check_openlane_v2(frames, tracks, progress=False)
+    assert found.faults == [str(error.value)]
+    assert (found.rows[0]["with log"], found.rows[0]["without log"], found.skipped) == (2, 2, [])
+    first.write_text("damaged")
+    assert len(check_openlane_v2(frames, tracks, progress=False).faults) == 1
+
+
 def test_tracks_are_written_once_and_are_those_of_one_subset(written):
     _, tracks = written
     with pytest.raises(UserError, match="is not empty"):

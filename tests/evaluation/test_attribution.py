@@ -28,6 +28,8 @@ from tflane_jax.evaluation.lane_groups import LANE_GROUPS, lane_groups
 from tflane_jax.evaluation.predict import predict_batch
 from tflane_jax.geometry import BevGrid
 from tflane_jax.models.host import HostConfig
+from tflane_jax.models.priors import PriorsConfig
+from tflane_jax.models.traffic_masks import TrafficMaskConfig
 from tflane_jax.scene import CenterlinePrediction, Prediction, RoadUser, SegmentPrediction, stack_examples
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 
@@ -194,4 +196,13 @@ def test_attention_is_a_distribution_over_the_road_users():
 )
 def test_a_model_whose_lanes_do_not_attend_is_named(model):
     with pytest.raises(UserError, match="do not attend to traffic"):
+        traffic_attention(model, {}, stack_examples([make_example()]))
+
+
+def test_one_softmax_over_lanes_and_traffic_has_no_weights_of_its_own():
+    """Regression: KeyError 'L_to_T'."""
+    traffic = WITH_TRAFFIC.priors.traffic_flow
+    module = replace(traffic.module, masking=TrafficMaskConfig(softmax="joint"))
+    model = replace(WITH_TRAFFIC, priors=PriorsConfig(traffic_flow=replace(traffic, module=module)))
+    with pytest.raises(UserError, match=r"one softmax, .*masking\.softmax=quadrants"):
         traffic_attention(model, {}, stack_examples([make_example()]))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,15 +11,16 @@ from typing import Any
 from tflane_jax.ablations.store import is_key
 from tflane_jax.config import RunConfig, load_config
 from tflane_jax.datasets import argoverse2
-from tflane_jax.datasets.base import SPLITS, Split
+from tflane_jax.datasets.base import SPLITS, Split, TrafficRateWarning
 from tflane_jax.datasets.data_source import Choice, DataSource
-from tflane_jax.datasets.sources import SOURCES, named_source, source_name, source_names, source_of
+from tflane_jax.datasets.sources import SOURCES, history_hz, named_source, source_name, source_names, source_of
 from tflane_jax.errors import UserError
+from tflane_jax.files.folders import named_folder
 from tflane_jax.models.host import HostConfig
 from tflane_jax.run_checks import EXAMPLE_NAMES, check_kind
 from tflane_jax.runs import Run, open_run, open_weights
 from tflane_jax.scene import Example, RoadImage
-from tflane_jax.tasks.fit import check_settings_fit
+from tflane_jax.tasks.fit import check_settings_fit, reads_traffic
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.tasks.lane_shape import LaneShapeTask
 from tflane_jax.tasks.traffic import limit_instances
@@ -117,7 +119,9 @@ def chosen_source(config: RunConfig, options: argparse.Namespace, split: Split |
     if options.data is None and options.root is None:
         return configured
     _check_choice(source, kind, options)
-    root, openlane = (None if path is None else Path(path) for path in (options.root, options.openlane))
+    # The name of a folder may be that of a split.
+    root = None if options.root is None else named_folder(options.root)
+    openlane = None if options.openlane is None else Path(options.openlane)
     return source.choose(Choice(chosen, given is not None, configured, root, openlane, option))
 
 
@@ -127,16 +131,39 @@ def source_for(run: Run, options: argparse.Namespace) -> Any:
     Other boxes would give numbers all the same: evidence would lie in the wrong place, and lanes that the model cannot
     perceive would count as missed.
     """
-    source, task = chosen_source(run.config, options), run.config.task
+    source = chosen_source(run.config, options)
+    _check_world(run, source, options)
+    _check_traffic(run, source)
+    return source
+
+
+def _check_world(run: Run, source: Any, options: argparse.Namespace) -> None:
+    """Raise UserError for a world that does not fit the model."""
+    task = run.config.task
     if options.data is None or named_source(options.data).root is not None or not isinstance(task, LaneGraphTask):
-        return source
+        return
     cameras = source.example.cameras
     try:
         check_settings_fit(task.model, source.example, image_scale=None if cameras is None else cameras.scale)
     except UserError as error:
         why = str(error).rpartition(": ")[0]  # without the remedy, which is for trainings
         raise UserError(f"--data {options.data} does not fit this model: {why}; choose data like its own") from None
-    return source
+
+
+def _check_traffic(run: Run, source: Any) -> None:
+    """Warn of data that lack the traffic flow that a model reads, or have it at another rate than it learned with."""
+    task = run.config.task
+    if not isinstance(task, LaneGraphTask) or not reads_traffic(task.model) or run.config.evaluation.traffic == "none":
+        return
+    found, learned = history_hz(source), history_hz(run.config.data.source("train"))
+    if found == 0.0:
+        said = "these data have no traffic flow, which this model reads: it sees none"
+    elif found and learned and abs(found - learned) > 0.05 * learned:
+        said = f"past frames of the traffic flow are at {found:g} Hz in these data, and this model learned at "
+        said += f"{learned:g} Hz"
+    else:
+        return
+    warnings.warn(said, TrafficRateWarning, stacklevel=4)
 
 
 def data_name(source: Any, options: argparse.Namespace) -> str:

@@ -270,4 +270,5 @@ SOURCE = DataSource(
     streams=lambda config: config.image is not None,
     views=_pictures,
     cameras=lambda config: None if config.image is None else RING,
+    tracks_hz=lambda config: 10.0,
 )

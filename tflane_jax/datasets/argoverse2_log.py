@@ -22,6 +22,7 @@ from tflane_jax.datasets.openlane_splits import openlane_timestamps
 from tflane_jax.datasets.plausible import FARTHEST, check_distance, check_interval, check_motion, check_place
 from tflane_jax.errors import UserError
 from tflane_jax.files.feather_table import Kind, read_columns
+from tflane_jax.files.folders import named_folder
 from tflane_jax.geometry import matrix_from_quaternion, pose_matrix
 from tflane_jax.scene import RoadUser
 from tflane_jax.scene.logs import KeyFrame, Log, Tracks, VectorMap
@@ -265,8 +266,9 @@ def _tracks(
     unknown = [n for n in names if n not in categories]
     if unknown:
         raise UserError(
-            f"{folder / ANNOTATIONS} has the unknown category {', '.join(unknown)}: "
-            "add it to `categories` with its road user"
+            f"{folder / ANNOTATIONS} has the unknown category {', '.join(unknown)}: rename it there to a known one, "
+            "such as REGULAR_VEHICLE, or add it with its road user to CATEGORIES of "
+            "tflane_jax/datasets/argoverse2_log.py"
         )
     traffic = np.isin(category_row, [i for i, n in enumerate(names) if categories[n] is not None])
     boxes = {name: column[traffic] for name, column in boxes.items()}
@@ -315,7 +317,7 @@ def find_logs(root: Path) -> list[Path]:
 
     Raises UserError if there is none, or if two have the same id.
     """
-    root = Path(root)
+    root = named_folder(root)  # that of one log tells its id
     if not root.exists():
         raise UserError(f"there is no {root}: name a folder of Argoverse 2 logs, or one log")
     patterns = ("", "*", "*/*", "sensor/*/*")

@@ -110,6 +110,10 @@ class TruncationWarning(UserWarning):
     """An example has more items in range than its capacity; some were left out."""
 
 
+class TrafficRateWarning(UserWarning):
+    """The traffic flow of examples is not at the rate at which a model learned, or there is none."""
+
+
 class MissingTracksWarning(UserWarning):
     """Frames whose source log is not at hand were left out, or have an empty traffic flow."""
 

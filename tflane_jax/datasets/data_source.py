@@ -106,6 +106,8 @@ class DataSource(Generic[ConfigT]):
         no_drives: why a scene of an evaluation is no whole drive, so that intervals over scenes are too narrow; "" if
             they are not.
         cameras: config -> names of the cameras whose images are read from files, in order; None for no such images.
+        tracks_hz: config -> frames a second of the tracks in its scenes; 0 without tracks, None where that is not known
+            without data.
     """
 
     name: str
@@ -129,6 +131,7 @@ class DataSource(Generic[ConfigT]):
     interval: Callable[[ConfigT], float | None] = lambda config: None
     no_drives: str = ""
     cameras: Callable[[ConfigT], tuple[str, ...] | None] = lambda config: None
+    tracks_hz: Callable[[ConfigT], float | None] = lambda config: None
 
 
 def split_config(config: type[ConfigT], data: Any, **own: Any) -> ConfigT:

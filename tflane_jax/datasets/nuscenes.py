@@ -29,8 +29,9 @@ from tflane_jax.datasets.nuscenes_cameras import (
     sample_cameras,
     vehicle_state,
 )
+from tflane_jax.datasets.nuscenes_can_bus import CAN_BUS_SIZE
 from tflane_jax.datasets.nuscenes_check import check_nuscenes
-from tflane_jax.datasets.nuscenes_depth import with_depth
+from tflane_jax.datasets.nuscenes_depth import with_depth, without_depth
 from tflane_jax.datasets.nuscenes_log import (
     ReferenceFrame,
     SceneFrames,
@@ -43,19 +44,19 @@ from tflane_jax.datasets.nuscenes_map import MapExpansion, read_expansion
 from tflane_jax.datasets.nuscenes_scenes import NUSCENES_SIZES
 from tflane_jax.datasets.nuscenes_splits import split_scenes
 from tflane_jax.datasets.nuscenes_tables import find_tables, shared_tables
-from tflane_jax.datasets.openlane_example import camera_views
-from tflane_jax.datasets.openlane_frames import FrameCamera
+from tflane_jax.datasets.openlane_example import camera_views, empty_views
+from tflane_jax.datasets.openlane_frames import SUBSETS, FrameCamera
 from tflane_jax.datasets.overlap import frame_drives
 from tflane_jax.datasets.photometric import PhotometricConfig
 from tflane_jax.datasets.prepared_map import prepare_map
 from tflane_jax.datasets.recent import Recent
 from tflane_jax.datasets.streaming import StreamingConfig
-from tflane_jax.datasets.view_images import TOPONET_SUBSET_B, ImageConfig, ImageFit
+from tflane_jax.datasets.view_images import TOPONET_SUBSET_B, ImageConfig, ImageFit, fit_image
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import relative_pose, transform_points
 from tflane_jax.limits import Count, Rules
-from tflane_jax.scene import CameraViews, Example
-from tflane_jax.scene.logs import Log
+from tflane_jax.scene import CameraViews, Example, VehicleState
+from tflane_jax.scene.logs import KeyFrame, Log, Tracks, VectorMap
 
 # Metres of map beyond the corners of the perception range, so that chains of lanes are merged as on the whole map.
 _BEYOND = 60.0
@@ -230,6 +231,22 @@ def _reach(config: ExampleConfig) -> float:
     return max(float(np.hypot(np.abs(r.x).max(), np.abs(r.y).max())) for r in ranges) + _BEYOND
 
 
+def nominal_example(config: NuScenesConfig) -> Example:
+    """Return an example in which nothing is valid, with the official image sizes: shapes that need no data."""
+    pose = np.eye(4)
+    tracks, moments = Tracks.empty(1), (KeyFrame(0, pose, 0),)
+    log = Log("none", "nuscenes", VectorMap({}), np.zeros(1, np.int64), pose[None], tracks, tracks, moments)
+    example = make_example(log, 0, config.example)
+    if config.image is None:
+        return example
+    sizes = SUBSETS["B"].sizes
+    fits = [fit_image(*size, config.image, front=place == 0) for place, size in enumerate(sizes)]
+    views = without_depth(empty_views(fits, config.image), config.depth_cell)
+    bus = None if config.can_bus == "none" else np.zeros(CAN_BUS_SIZE, np.float32)
+    pose = pose.astype(np.float32)
+    return replace(example, cameras=replace(views, vehicle=VehicleState(pose, pose, bus)))
+
+
 @dataclass(frozen=True)
 class NuScenesData(NuScenesSettings):
     """nuScenes, read from disk while training; `depth_cell` is of training images, others need no depth.
@@ -272,6 +289,10 @@ def _views(config: NuScenesConfig, numbers: Sequence[int]) -> list[CameraViews |
     return [dataset.views(number) for number in numbers]
 
 
+def _sample(config: NuScenesConfig) -> Example:
+    return NuScenesDataset(config).example(0) if Path(config.root).is_dir() else nominal_example(config)
+
+
 SOURCE = DataSource(
     name="nuscenes",
     data=NuScenesData,
@@ -279,6 +300,7 @@ SOURCE = DataSource(
     example=Example,
     dataset=NuScenesDataset,
     streams=lambda config: config.image is not None,
+    sample=_sample,
     choose=_choose,
     title=lambda config: f"nuscenes-{config.split}",
     drives=lambda config: frame_drives(NuScenesDataset(config)),
@@ -287,4 +309,5 @@ SOURCE = DataSource(
     views=_views,
     interval=lambda config: 0.5,
     cameras=lambda config: None if config.image is None else CAMERAS,
+    tracks_hz=lambda config: 2.0,
 )

@@ -18,12 +18,18 @@ from tflane_jax.errors import UserError
 def check_nuscenes(root: Path) -> FolderCheck:
     """Read every table, every scene and the map of every city; images are only looked for.
 
+    A folder without `samples` is one of tables and maps, for models that see no images: that is no fault.
+
     Raises UserError where there are no tables or they cannot be joined.
     """
     tables = read_tables(find_tables(root))
     faults: list[str] = []
     maps: dict[str, MapExpansion | None] = {}
     counts: dict[str, Counter[str]] = {}
+    samples = tables.root / "samples"
+    skipped = [] if samples.is_dir() else [f"images were not looked for: there is no {samples}"]
+    if not tables.scenes():
+        faults.append(f"{tables.folder / 'scene.json'} holds no scene: unpack the tables again")
     for name, scene in sorted(tables.scenes().items()):
         location = tables.location(scene)
         if location not in maps:
@@ -38,13 +44,13 @@ def check_nuscenes(root: Path) -> FolderCheck:
         except UserError as error:
             faults.append(f"{name}: {error}")
             continue
-        absent = missing_images(tables, frames.samples)
+        absent = [] if skipped else missing_images(tables, frames.samples)
         if absent:
             faults.append(f"{name}: {len(absent)} images are missing (first {absent[0]})")
         count.update({"key frames": tracks.frames, "road users": len(tracks.uuid)})
         count.update({"boxes": int(tracks.valid.sum()), "missing images": len(absent)})
     rows = [_row(location, counts[location], maps[location]) for location in counts]
-    return FolderCheck(f"nuScenes, {tables.folder.name}", rows, faults)
+    return FolderCheck(f"nuScenes, {tables.folder.name}", rows, faults, skipped)
 
 
 def _checked_map(path: Path, faults: list[str]) -> MapExpansion | None:

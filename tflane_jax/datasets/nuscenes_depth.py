@@ -6,6 +6,7 @@ pose the images themselves take (`nuscenes_cameras.CameraPoses`). Of the points 
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -60,15 +61,23 @@ def with_depth(
     """
     points = read_sweep(tables.root / tables.sensor_file(sample, LIDAR)["filename"])
     points = transform_points(tables.calibration(sample), points)
-    count, height, width = views.image.shape[:3]
-    depth = np.zeros((count, -(-height // cell), -(-width // cell)), np.float32)
-    valid = np.zeros(depth.shape, bool)
+    views = without_depth(views, cell)
+    depth, valid = np.asarray(views.depth), np.asarray(views.depth_valid)
     for number, camera in enumerate(sample_cameras(tables, sample, global_from_ego)):
         if camera is not None and views.valid[number]:
             local = transform_points(invert_pose(camera.ego_from_camera), points)
             size = (int(views.size[number, 0]), int(views.size[number, 1]))
             depth[number], valid[number] = nearest_depth(local, views.intrinsics[number], size, cell, depth.shape[1:])
-    return views.replace(depth=depth, depth_valid=valid)  # pyright: ignore[reportAttributeAccessIssue]
+    return views
+
+
+def without_depth(views: CameraViews, cell: int | None) -> CameraViews:
+    """Return images with arrays for the depth of cells (pixels), in which none is valid; without them for None."""
+    if cell is None:
+        return views
+    count, height, width = views.image.shape[:3]
+    depth = np.zeros((count, -(-height // cell), -(-width // cell)), np.float32)
+    return replace(views, depth=depth, depth_valid=np.zeros(depth.shape, bool))
 
 
 def nearest_depth(

@@ -210,7 +210,10 @@ def road_user(category: str, where: str, categories: Mapping[str, RoadUser | Non
     for length in range(len(parts), 0, -1):
         if (name := ".".join(parts[:length])) in categories:
             return categories[name]
-    raise UserError(f"{where}: unknown category {category!r}: add it to `categories` with its road user")
+    raise UserError(
+        f"{where}: unknown category {category!r}: name it below a known one there, such as vehicle.car.{parts[-1]}, or "
+        "add it to CATEGORIES of tflane_jax/datasets/nuscenes_log.py with its road user"
+    )
 
 
 def _category(tables: Tables, annotation: Row, categories: Mapping[str, RoadUser | None]) -> RoadUser | None:

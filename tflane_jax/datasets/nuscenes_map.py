@@ -148,6 +148,10 @@ class _MapFile:
     def __init__(self, path: Path):
         self.path = path
         self.content = load_json(path)
+        if isinstance(self.content, Mapping) and "version" not in self.content:
+            raise UserError(
+                f"{path} names no version, as the first ones do, which have no arclines: download version 1.3"
+            )
         version = str(member(self.content, "version", str(path)))
         parts = version.split(".")
         if not all(part.isdecimal() and len(part) < 10 for part in parts) or tuple(map(int, parts)) < _FIRST_VERSION:

@@ -141,4 +141,5 @@ SOURCE = DataSource(
     drives=lambda config: frame_drives(SceneFileDataset(config)),
     root="a scene file (npz) or a folder of them",
     check=check_scene_files,
+    tracks_hz=lambda config: 2.0,
 )

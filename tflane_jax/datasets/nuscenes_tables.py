@@ -20,6 +20,7 @@ from jaxtyping import Float
 from tflane_jax.datasets.plausible import FARTHEST
 from tflane_jax.errors import UserError
 from tflane_jax.files.fields import numbers
+from tflane_jax.files.folders import named_folder
 from tflane_jax.files.json_rows import json_rows
 from tflane_jax.files.wording import shown
 from tflane_jax.geometry import matrix_from_quaternion, pose_matrix
@@ -192,7 +193,7 @@ def find_tables(root: Path, version: str | None = None) -> Path:
             raise UserError(f"{root} holds no {version}/sample.json: name the data set's folder and its version")
         return root / version
     if (root / "sample.json").is_file():
-        return root
+        return named_folder(root)  # the name tells the split, and maps lie beside it
     found = sorted(path.parent for path in root.glob("*/sample.json"))
     if not found:
         raise UserError(f"{root} holds no nuScenes tables: there is no v1.0-*/sample.json in it")

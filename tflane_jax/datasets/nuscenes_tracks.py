@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from tflane_jax.datasets.log_frames import KEPT_LOGS
 from tflane_jax.datasets.nuscenes_log import Visibility, scene_frames, scene_log
 from tflane_jax.datasets.nuscenes_tables import find_tables, shared_tables
+from tflane_jax.datasets.recent import Recent
 from tflane_jax.errors import UserError
 from tflane_jax.scene.logs import Log
 
 
 class SceneTracks:
-    """Scenes by name or token, read when they are needed and kept.
+    """Scenes by name or token, read when they are needed, once, and kept. Threads may ask for them.
 
     A log's poses are level (`nuscenes_log`): a frame of another data set must have its pose levelled with `level_poses`
     before its traffic flow is taken from here.
@@ -28,7 +30,7 @@ class SceneTracks:
         scenes = self.tables.scenes()
         self._scenes = {**{scene["token"]: scene for scene in scenes.values()}, **scenes}
         self._least_visibility: Visibility = least_visibility
-        self._logs: dict[str, Log] = {}
+        self._log = Recent(self._read, KEPT_LOGS)
 
     def __contains__(self, name: str) -> bool:
         return name in self._scenes
@@ -41,10 +43,9 @@ class SceneTracks:
         """Return a scene with an empty map; raises UserError for one that is damaged or not in the tables."""
         if name not in self._scenes:
             raise UserError(f"{self.tables.folder} has no scene {name}")
+        return self._log(self._scenes[name]["name"])
+
+    def _read(self, name: str) -> Log:
         scene = self._scenes[name]
-        if scene["name"] not in self._logs:
-            frames = scene_frames(self.tables, scene)
-            self._logs[scene["name"]] = scene_log(
-                self.tables, scene, frames, None, least_visibility=self._least_visibility
-            )
-        return self._logs[scene["name"]]
+        frames = scene_frames(self.tables, scene)
+        return scene_log(self.tables, scene, frames, None, least_visibility=self._least_visibility)

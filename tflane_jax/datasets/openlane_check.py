@@ -35,6 +35,8 @@ from tflane_jax.files.openlane import CENTERLINE, SEGMENT, FrameKey
 from tflane_jax.progress import progress_bar
 
 _WITH_LOG, _WITHOUT_LOG, _WITH_TRAFFIC = "with log", "without log", "with traffic"
+# Name of the log of a segment whose files do not tell it; no log has it.
+_NO_LOG = ""
 _COUNTS = ("segments", "frames", "-ls files", "images", "lanes", "lane segments", "elements", "areas", "SD maps")
 
 
@@ -97,12 +99,18 @@ def check_openlane_v2(
                     f"{min(absent)})"
                 )
             there = [key for key in keys if key not in absent]
-            logs = None if tracks is None else _logs(root, there, subset, tracks, alone=len(present) == 1)
+            logs, unnamed = None, {}
+            if tracks is not None:
+                logs, unnamed = _logs(root, there, subset, tracks, alone=len(present) == 1)
             counts = _check_frames(root, there, subset, logs, CameraChecks(images), cameras, faults, progress)
+            # What makes a file unreadable has been reported.
+            faults += [why for path, why in unnamed.items() if not any(str(path) in fault for fault in faults[found:])]
             counts["segments"] = len({key.segment for key in keys})
             counts["SD maps"] = _check_sd_maps(root, there, faults)
             content = counts if tracks is None else _with_share(counts)
-            if logs is not None and (lacking := logs.lacking(there)):
+            lacking = Counter() if logs is None else logs.lacking(there)
+            del lacking[_NO_LOG]  # a fault
+            if lacking:
                 skipped.append(
                     f"{lacking.total()} of {len(there)} {split} frames have no log in {tracks}, so no traffic flow: "
                     f"it lacks {listed(lacking, len(lacking))}"
@@ -231,25 +239,29 @@ def _check_motion(
         yield str(error)
 
 
-def _logs(root: Path, keys: list[FrameKey], subset: SubsetName, tracks: Path, *, alone: bool) -> SourceTracks | None:
-    """Return the logs of a split; the files of a segment that do not name theirs have none.
+def _logs(
+    root: Path, keys: list[FrameKey], subset: SubsetName, tracks: Path, *, alone: bool
+) -> tuple[SourceTracks | None, dict[Path, str]]:
+    """Return the logs of a split, and by file why its segment's log is not known; such a segment has none.
 
     `tracks` may hold those of one subset; None for the other, unless the subset stands alone.
     """
     named: dict[tuple[str, str], str] = {}
+    unnamed: dict[Path, str] = {}
     for key in keys:
         suffix = CENTERLINE.suffix if info_path(root, key, CENTERLINE.suffix).is_file() else SEGMENT.suffix
         if (key.split, key.segment) not in named:
             try:
                 named |= source_logs(root, [key], suffix)
-            except UserError:  # a fault of the file, which its own check reports
-                named[key.split, key.segment] = ""
+            except UserError as error:
+                named[key.split, key.segment] = _NO_LOG
+                unnamed[info_path(root, key, suffix)] = str(error)
     try:
-        return SourceTracks(tracks, subset, named)
+        return SourceTracks(tracks, subset, named), unnamed
     except UserError:
         if alone:
             raise
-        return None
+        return None, {}
 
 
 def _check_tracks(logs: SourceTracks, key: FrameKey, frame: FrameFile, counts: Counter[str]) -> Iterator[str]:

@@ -23,6 +23,7 @@ from tflane_jax.datasets.plausible import FARTHEST, MOST_PIXELS
 from tflane_jax.errors import UserError
 from tflane_jax.files.fields import file_within, is_time, items, load_json, load_members, member, numbers
 from tflane_jax.files.openlane import CENTERLINE, SEGMENT, FrameKey
+from tflane_jax.files.wording import shown
 from tflane_jax.geometry import pose_matrix
 
 SubsetName = Literal["A", "B"]
@@ -40,6 +41,7 @@ class Subset:
         tick_ns: unit of the timestamps, nanoseconds.
         first_segment: number of the first segment of each split.
         data_dict: name of the split file.
+        tracks_hz: frames a second of the boxes in the source logs.
     """
 
     cameras: tuple[str, ...]
@@ -47,6 +49,7 @@ class Subset:
     tick_ns: int
     first_segment: Mapping[Split, int]
     data_dict: str
+    tracks_hz: float
 
 
 SUBSETS: Mapping[SubsetName, Subset] = {
@@ -64,6 +67,7 @@ SUBSETS: Mapping[SubsetName, Subset] = {
         tick_ns=1,
         first_segment={"train": 0, "val": 10_000, "test": 20_000},
         data_dict="data_dict_subset_A.json",
+        tracks_hz=10.0,
     ),
     "B": Subset(
         cameras=("CAM_FRONT", "CAM_FRONT_RIGHT", "CAM_FRONT_LEFT", "CAM_BACK", "CAM_BACK_LEFT", "CAM_BACK_RIGHT"),
@@ -71,6 +75,7 @@ SUBSETS: Mapping[SubsetName, Subset] = {
         tick_ns=1000,
         first_segment={"train": 1000, "val": 11_000, "test": 21_000},
         data_dict="data_dict_subset_B.json",
+        tracks_hz=2.0,
     ),
 }
 
@@ -245,6 +250,8 @@ def source_logs(root: Path, keys: Sequence[FrameKey], suffix: str = "") -> dict[
             path = info_path(root, key, suffix)
             meta = member(load_members(path, ("meta_data",)), "meta_data", str(path))
             log = member(meta, "source_id", f"{path}: meta_data")
+            if not isinstance(log, str | int) or log == "":
+                raise UserError(f"{path}: meta_data.source_id is {shown(log)}, expected the name of the source log")
             logs[key.split, key.segment] = str(log)
     return logs
 

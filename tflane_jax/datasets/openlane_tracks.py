@@ -20,9 +20,11 @@ from jaxtyping import Float
 from tflane_jax.datasets.argoverse2_log import city_of, find_logs, load_log
 from tflane_jax.datasets.base import ExampleConfig, MissingTracksWarning
 from tflane_jax.datasets.examples import traffic_flow, warn_dropped
+from tflane_jax.datasets.log_frames import KEPT_LOGS
 from tflane_jax.datasets.nuscenes_log import level_poses
 from tflane_jax.datasets.nuscenes_tracks import SceneTracks
 from tflane_jax.datasets.openlane_frames import SUBSETS, SubsetName
+from tflane_jax.datasets.recent import Recent
 from tflane_jax.errors import UserError
 from tflane_jax.files.openlane import FrameKey
 from tflane_jax.scene import TrafficFlow
@@ -39,7 +41,7 @@ _NAMED, _NAMED_IN_FULL = 3, 50
 
 
 class SourceTracks:
-    """The logs at hand, read when they are needed and kept: about 1 MB each.
+    """The logs at hand, read when they are needed, once, and kept: about 1 MB each. Threads may ask for them.
 
     Args:
         root: folder of the logs, as for `argoverse2_log.find_logs`, or of nuScenes, as for
@@ -135,7 +137,7 @@ class _Argoverse2:
 
     def __init__(self, root: Path):
         self._folders = {folder.name: folder for folder in find_logs(root)}
-        self._read: dict[str, Log] = {}
+        self.log = Recent(self._read, KEPT_LOGS)
 
     def __contains__(self, name: str) -> bool:
         return name in self._folders
@@ -143,10 +145,8 @@ class _Argoverse2:
     def area(self, name: str) -> str:
         return city_of(self._folders[name])
 
-    def log(self, name: str) -> Log:
-        if name not in self._read:
-            self._read[name] = load_log(self._folders[name], keyframes="annotations", with_map=False)
-        return self._read[name]
+    def _read(self, name: str) -> Log:
+        return load_log(self._folders[name], keyframes="annotations", with_map=False)
 
 
 def listed(names: Iterable[str], most: int = _NAMED) -> str:

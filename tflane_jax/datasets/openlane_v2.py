@@ -342,4 +342,5 @@ SOURCE = DataSource(
     tracks=True,
     interval=lambda config: 0.5,
     cameras=lambda config: None if config.image is None else SUBSETS[config.subset].cameras,
+    tracks_hz=lambda config: 0.0 if config.tracks is None else SUBSETS[config.subset].tracks_hz,
 )

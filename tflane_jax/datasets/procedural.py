@@ -279,6 +279,7 @@ SOURCE = DataSource(
     sample=lambda config: ProceduralDataset(config).example(0),
     build=lambda config, progress: len(_open(config, progress)),
     interval=_interval,
+    tracks_hz=lambda config: config.world.rate_hz,
 )
 CAMERAS = replace(SOURCE, name="world-cameras", choose=_choose_cameras)
 """The same world with a ring of cameras, under a name of its own for `tflane data show`."""

@@ -246,4 +246,5 @@ SOURCE = DataSource(
     drives=_drives,
     recorded=False,
     check=check_real_maps,
+    tracks_hz=lambda config: config.world.rate_hz,
 )

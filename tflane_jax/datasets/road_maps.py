@@ -22,6 +22,7 @@ from tflane_jax.datasets.nuscenes_place import SCENE_TABLE, read_scene, scene_fi
 from tflane_jax.datasets.nuscenes_scene_files import read_scene_file, scene_file_outline
 from tflane_jax.datasets.openlane_maps import map_name, read_segment, segment_files
 from tflane_jax.errors import UserError
+from tflane_jax.files.folders import named_folder
 from tflane_jax.geometry import pose_yaw, transform_points
 from tflane_jax.scene import RoadUser
 from tflane_jax.scene.logs import Log
@@ -114,7 +115,7 @@ def find_maps(root: Path) -> list[MapFile]:
 
     Raises UserError if there is none, or if two have the same name.
     """
-    root = Path(root)
+    root = named_folder(root)  # that of one log tells its name
     if not root.exists():
         raise UserError(f"there is no {root}: name a folder of logs, or one log")
     found = sorted(_found(root), key=lambda one: one.name)

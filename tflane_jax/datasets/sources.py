@@ -133,6 +133,15 @@ def drawing_views(config: Any, numbers: Sequence[int]) -> list[CameraViews | Non
     return [None] * len(numbers) if views is None else views(config, numbers)
 
 
+def history_hz(config: Any) -> float | None:
+    """Return the rate of the past frames in the traffic flow of a config's examples; 0 without traffic flow.
+
+    None where that is not known without data.
+    """
+    recorded = source_of(config).tracks_hz(config)
+    return recorded and (config.example.history_hz or recorded)
+
+
 def source_name(config: Any) -> str:
     """Return the name of a config for titles and files."""
     return source_of(config).title(config)

@@ -156,11 +156,16 @@ def traffic_attention(
         The last decoder layer's predictions, stacked, and the weights: each row sums to 1, without traffic to 0.
 
     Raises:
-        UserError: lanes of this model do not attend to traffic.
+        UserError: lanes of this model do not attend to traffic, or share the softmax of lanes with it.
     """
     traffic = model.priors.traffic_flow
     if traffic is None or traffic.insert == "nowhere" or "L->T" not in traffic.module.fusions:
         raise UserError("lanes of this model do not attend to traffic: see task.model.priors.traffic_flow")
+    if traffic.module.masking.softmax == "joint":
+        raise UserError(
+            "lanes of this model attend to lanes and traffic by one softmax, so that the weights of road users do not "
+            "sum to 1: choose a model with task.model.priors.traffic_flow.module.masking.softmax=quadrants"
+        )
     return jax.device_get(_attention(model, params, examples))
 
 

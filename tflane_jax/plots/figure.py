@@ -13,6 +13,7 @@ import numpy as np
 
 from tflane_jax.errors import UserError, missing_extra
 from tflane_jax.files.atomic import replacing
+from tflane_jax.plots import style
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -44,12 +45,23 @@ def new_figure(
 
             picture, small = io.BytesIO(), io.BytesIO()
             self.savefig(picture, dpi=90, format="png")
-            colours = Image.open(picture).convert("RGB").quantize(256, dither=Image.Dither.NONE)
+            # Counting pixels, as by default, the grains of the evidence would take nearly all colours, and a legend
+            # would show a bus in brown.
+            every = Image.Quantize.MAXCOVERAGE
+            colours = Image.open(picture).convert("RGB").quantize(256, every, dither=Image.Dither.NONE)
             colours.save(small, "png", optimize=True)
             return small.getvalue()
 
     figure = NotebookFigure((columns * panel[0], rows * panel[1] + footer), layout="constrained")
-    return figure, figure.subplots(rows, columns, squeeze=False)
+    axes = figure.subplots(rows, columns, squeeze=False)
+    for ax in axes.flat:
+        ax.set_prop_cycle(color=style.SERIES)
+    return figure, axes
+
+
+def columns_for(panels: int) -> int:
+    """Return the number of columns of a grid of curves: three, or two where the last row would hold a single panel."""
+    return min(panels, 2 if panels == 4 else 3)
 
 
 def save_figure(figure: Figure, path: Path, *, dpi: int = 110) -> Path:

@@ -1,6 +1,7 @@
 """The arithmetic of the benchmarks; no test asserts a time."""
 
 import importlib
+import importlib.util
 import json
 import math
 import subprocess
@@ -98,6 +99,11 @@ def test_speed_and_accuracy_of_masks_stand_in_one_table(tmp_path):
     table = masking_variants.speed_and_scores(timings, scores).splitlines()
     assert [cell.strip() for cell in table[2].split("|")[1:-1]] == [variants[0], "2.00 ms", "1last", "1last"]
     assert [cell.strip() for cell in table[3].split("|")[1:-1]] == [variants[1], "1.50", "2last", "2last"]
+    if importlib.util.find_spec("matplotlib"):
+        spread = {name: dict.fromkeys(masking_variants.SCORES, "45.3 ± 0.2") for name in variants[1:]}
+        for shown in ({}, spread):
+            path = masking_variants.save_picture(tmp_path / "masks.png", timings, shown)
+            assert path.stat().st_size > 2000
     del scores[variants[1]]
     assert masking_variants.speed_and_scores(timings, scores).splitlines()[3].count(" - ") == 2
 

@@ -76,6 +76,16 @@ def test_errors_and_losses_do_not_squeeze_the_scores(tmp_path, figures):
     }
 
 
+def test_a_score_has_one_colour_in_all_panels_and_zero_is_at_the_bottom(tmp_path, figures):
+    record = {"all/AP": 0.1, "all/recall": 0.5, "clear/recall": 0.6, "hidden/recall": 0.0}
+    save_curves(tmp_path / "curves.png", [{"step": step, "split": "val"} | record for step in (1, 2)])
+    recall = [line.get_color() for ax in figures[0].axes for line in ax.lines if line.get_label() == "recall"]
+    assert len(recall) == 3
+    assert len(set(recall)) == 1
+    (hidden,) = [ax for ax in figures[0].axes if ax.get_title(loc="left") == "val: hidden"]
+    assert hidden.get_ylim() == (0.0, 1.0)
+
+
 def test_scores_have_a_linear_axis_and_those_of_single_thresholds_are_left_out(tmp_path, figures):
     low, high = ({"all/recall": v, "all/recall@1.0": v} for v in (0.001, 0.5))
     save_curves(tmp_path / "curves.png", [{"step": 1, "split": "val"} | low, {"step": 2, "split": "val"} | high])

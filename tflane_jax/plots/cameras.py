@@ -17,7 +17,7 @@ from tflane_jax.plots import style
 from tflane_jax.plots.bev import GROUND, VIEW, draw_found, draw_scene, truth_layers
 from tflane_jax.plots.figure import new_figure, save_figure
 from tflane_jax.plots.images import draw_image
-from tflane_jax.plots.legends import above_entries, boundary_entries
+from tflane_jax.plots.legends import above_entries, boundary_entries, truth_entry
 from tflane_jax.plots.lines import valid_rows
 from tflane_jax.plots.map_lines import chosen_lines, class_entries
 from tflane_jax.plots.segments import LanePrediction, boundary_types, chosen_areas, chosen_segments
@@ -302,7 +302,7 @@ def legend_entries(lanes: LanePrediction | None) -> list:
     from matplotlib.lines import Line2D
 
     if isinstance(lanes, LinePrediction):
-        return class_entries()
+        return [*class_entries(), truth_entry()]
     names = ("lane ahead", "to the left", "back", "to the right")
     colours = _direction_colours(np.array([0.0, 0.5, 1.0, -0.5]) * np.pi)
     ways = [Line2D([], [], color=colour, lw=1.5, label=name) for colour, name in zip(colours, names, strict=True)]

@@ -55,10 +55,13 @@ def save_curves(path: Path, records: Iterable[Mapping[str, Any]]) -> Path:
     figure, axes = new_figure(-(-len(groups) // columns), columns, panel=(4.6, 3.2), footer=footer)
     if seeds > 1:
         figure.supxlabel(BANDS.replace("runs", f"{seeds} seeds"), fontsize=8)
+    # A score has one colour in all panels.
+    scores = _styles(dict.fromkeys(name.partition("/")[2] for split, name in series if split == "val"))
     for ax, ((split, group, kind), names) in zip(axes.flat, groups.items(), strict=False):
         ax.set_title((f"{split}: {group}" if split else group) + kind, fontsize=9, loc="left")
         found = {name.removeprefix(f"{group}/"): series[split, name] for name in names}
-        _draw_panel(ax, found, _styles(found), log=split == "train")
+        own = scores if scores.keys() >= found.keys() else _styles(found)
+        _draw_panel(ax, found, own, log=split == "train")
         if list(found) != [group]:
             # Beside the panel, because there are curves everywhere in it.
             ax.legend(fontsize=7, frameon=False, loc="upper left", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.0)
@@ -169,6 +172,8 @@ def _draw_panel(
     seen = seen[np.isfinite(seen)]
     if log and len(seen) and seen.min() > 0.0 and seen.max() > 30.0 * seen.min():
         ax.set_yscale("log")
+    if not seen.any():
+        ax.set_ylim(0.0, 1.0)  # nothing found: zero is at the bottom, not in the middle
     ax.set_xlabel("step", fontsize=8)
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     ax.tick_params(labelsize=7)

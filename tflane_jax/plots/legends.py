@@ -69,4 +69,4 @@ def above_entries(lanes: LanePrediction | None, examples: Example) -> list:
     """Return the entries of a legend for the view from above, beside camera images that explain the rest."""
     if lanes is None:
         return [hidden_entry(), *([] if examples.map_lines is not None else visibility_entries())]
-    return [truth_entry(), *([] if isinstance(lanes, LinePrediction) else prediction_entries())]
+    return [] if isinstance(lanes, LinePrediction) else [truth_entry(), *prediction_entries()]

@@ -22,7 +22,7 @@ from benchmarks import (
     paper_sizes,
 )
 from benchmarks.gpu import matching, side_by_side, steps
-from benchmarks.timing import command_line, compile_jax, interleave, markdown_table, summarise
+from benchmarks.timing import command_line, compile_jax, interleave, load_notice, markdown_table, summarise
 from tests.shared import ROOT
 from tflane_jax.ablations.paper.tf_lane import MASKING
 from tflane_jax.config import WorldData, load_config
@@ -216,6 +216,13 @@ def test_an_update_is_planned_for_devices_that_a_cpu_plays(tmp_path):
     assert shared["exchanges"]["all-gather"][1] >= shared["parameters"]
     assert shared["arguments"] < 0.6 * whole["arguments"]
     assert "Estimate, not a measurement" in (tmp_path / "collectives.md").read_text()
+
+
+def test_a_busy_machine_is_named():
+    assert load_notice({"load": [1.9, 0.1, 0.1], "cores": 2}) == load_notice({}) == ""
+    busy = {"load": [6.94, 0.1, 0.1], "cores": 2}
+    for record in (busy, {"machine": busy, "results": []}):
+        assert "load 6.9 on 2 cores" in load_notice(record)
 
 
 def test_table_is_aligned():

@@ -23,7 +23,19 @@ def test_a_notebook_shows_the_colours_of_the_legend():
     shown = np.round(imread(io.BytesIO(figure._repr_png_()))[..., :3] * 255).astype(int)
     for user, colour in style.ROAD_USER.items():
         rgb = [int(colour[i : i + 2], 16) for i in (1, 3, 5)]
-        assert (np.abs(shown - rgb).max(-1) <= 4).any(), user
+        assert (np.abs(shown - rgb).max(-1) <= 1).any(), user
+
+
+def test_a_notebook_shows_lines_in_their_colours():
+    figure, axes = new_figure(panel=(6.0, 3.0))
+    for start in range(3):
+        axes[0, 0].plot(np.random.default_rng(start).random(9), label=str(start))
+    axes[0, 0].legend()
+    shown = np.round(imread(io.BytesIO(figure._repr_png_()))[..., :3] * 255).astype(int)
+    for colour in style.SERIES[:3]:
+        rgb = [int(colour[i : i + 2], 16) for i in (1, 3, 5)]
+        assert (shown == rgb).all(-1).sum() > 50, colour
+    assert (shown[0, 0] == 255).all()
 
 
 def test_curves_of_a_notebook_have_the_colours_of_the_library():

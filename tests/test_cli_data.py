@@ -126,6 +126,13 @@ def test_data_show_draws_world_cameras(tmp_path, capsys):
     assert "traffic lights and signs" in capsys.readouterr().out
 
 
+def test_a_split_of_the_world_stands_beside_all_recorded_logs(tmp_path, capsys):
+    """The command of docs/real_roads.md: recordings have no splits, so that --split is the world's."""
+    command = ["data", "stats", "--data", "street", "--split", "val", "--count", "1"]
+    assert main([*command, "--beside", f"recorded={tmp_path / 'absent'}"]) == 2
+    assert "there is no" in capsys.readouterr().err
+
+
 def test_distributions_of_several_data_are_laid_side_by_side(tmp_path, capsys):
     maps = tmp_path / "maps"
     maps.mkdir()

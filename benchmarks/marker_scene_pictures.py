@@ -13,9 +13,10 @@ from tflane_jax.datasets.procedural import ProceduralConfig
 from tflane_jax.geometry import relative_pose
 from tflane_jax.plots import new_figure, save_figure
 from tflane_jax.plots.bev import draw_ego, draw_found, draw_lanes, draw_scene, prepare
-from tflane_jax.plots.gallery import label_edges, panel_size, prediction_entries
+from tflane_jax.plots.gallery import label_edges, panel_size
+from tflane_jax.plots.legends import hidden_entry, prediction_entries, truth_entry, visibility_entries
 from tflane_jax.plots.marker_drive import OUTCOMES, draw_boards, draw_guidance, trust_colours
-from tflane_jax.plots.style import LANE_CLEAR, LANE_HIDDEN, ROAD
+from tflane_jax.plots.style import ROAD
 from tflane_jax.priors.marker_memory import MarkerGuidance
 from tflane_jax.scene import CameraViews, Example, Prediction
 from tflane_jax.scene.logs import KeyFrame
@@ -112,7 +113,7 @@ def save_gaps(path: Path, gaps: Sequence[Gap], source: ProceduralConfig) -> Path
         _draw_place(memory, gap)
         draw_ego(memory)
         for ax, name in zip(models, rows, strict=True):
-            draw_found(ax, gap.truth, lanes_of(gap.found[name]), ground=ground, view=view, title=f"model: {name}")
+            draw_found(ax, gap.truth, lanes_of(gap.found[name]), ground=ground, view=view, title=name)
     label_edges(axes[:, 1:])
     figure.legend(handles=_entries(), loc="outside lower center", ncols=10, fontsize=8, frameon=False)
     return save_figure(figure, path)
@@ -147,7 +148,6 @@ def _small(outcome: Any) -> dict[str, Any]:
 
 def _entries() -> list[Any]:
     from matplotlib.lines import Line2D
-    from matplotlib.patches import Patch
 
     doubted, half, trusted = trust_colours(np.array([0.0, 0.5, 1.0]))
     return [
@@ -156,10 +156,9 @@ def _entries() -> list[Any]:
             Line2D([], [], color=colour, lw=2, label=f"lane of a board, c = {c}")
             for colour, c in ((trusted, 1), (half, 0.5), (doubted, 0))
         ),
-        Line2D([], [], color=LANE_CLEAR, lw=2, label="true lane in view"),
-        Line2D([], [], color=LANE_HIDDEN, lw=2, label="true lane hidden"),
-        Patch(facecolor="#0f1116", edgecolor="#5a6373", hatch="////", lw=0, label="ground out of sight"),
-        Line2D([], [], color="#b0b3ba", lw=1, label="truth beside memory and models"),
+        *visibility_entries(),
+        hidden_entry(),
+        truth_entry(),
         *prediction_entries(),
     ]
 

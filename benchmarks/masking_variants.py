@@ -5,11 +5,13 @@
 The module (temporal and spatial encoder) of `configs/tf_lane/masking.py` on random tracks, for the number of lane
 queries of the small host and of the papers. A variant's time includes making its mask from the distances between
 lanes and tracks. Ratios are to the paper's masks (LT/LL), in one run. Beside them stand the scores of the trained
-variants, where docs/results holds them (`tflane tables tf_lane.masking --record docs/results`).
+variants, where docs/results holds them (`tflane tables tf_lane.masking --record docs/results`). Table, JSON and picture
+(cost beside score) are written to the folder.
 """
 
 from __future__ import annotations
 
+import importlib.util
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -26,6 +28,9 @@ from tflane_jax.geometry import PerceptionRange
 from tflane_jax.models.prior import HostQueries, HostSpec
 from tflane_jax.models.traffic_flow_module import SpatialEncoder, TemporalEncoder, TrafficFlowConfig
 from tflane_jax.models.traffic_masks import spatial_mask
+from tflane_jax.plots.figure import new_figure, save_figure
+from tflane_jax.plots.style import curve_style
+from tflane_jax.plots.tables import written_to
 from tflane_jax.priors.traffic_flow import TrafficFlowTokens
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 
@@ -123,8 +128,45 @@ def speed_and_scores(
     return markdown_table(["masks", *(f"{count} queries" for count in timings), *columns], rows)
 
 
+def save_picture(
+    path: Path, timings: Mapping[str, Mapping[str, Mapping[str, float]]], scores: Mapping[str, Mapping[str, str]]
+) -> Path:
+    """Draw the cost of each variant and, where it was trained, its scores; return the path.
+
+    Args:
+        path: .png, .pdf or .svg.
+        timings, scores: as for `speed_and_scores`.
+    """
+    names = list(next(iter(timings.values())))
+    places, shown = np.arange(len(names)), SCORES if scores else ()
+    figure, axes = new_figure(1, 1 + len(shown), panel=(3.4, 0.9 + 0.24 * len(names)), footer=0.3)
+    cost, height = axes[0, 0], 0.8 / len(timings)
+    for number, (count, by_name) in enumerate(timings.items()):
+        ratios = [by_name[name]["ratio"] for name in names]
+        offset = height * (number - 0.5 * (len(timings) - 1))
+        cost.barh(places + offset, ratios, height, color=curve_style(number)["color"], label=f"{count} queries")
+    cost.axvline(1.0, color="black", lw=0.9, ls="--")
+    cost.set_title(f"time of the module ({PAPER}: the paper's masks)", fontsize=9, loc="left")
+    cost.set_xlabel(f"multiple of {PAPER}", fontsize=8)
+    figure.legend(handles=cost.containers, loc="outside lower left", ncols=len(timings), fontsize=8, frameon=False)
+    for ax, score in zip(axes[0, 1:], shown, strict=True):
+        found = {i: scores[name][score].split(" ± ") for i, name in enumerate(names) if name in scores}
+        means = [float(mean) for mean, *_ in found.values()]
+        spread = [float(one[1]) if len(one) > 1 else 0.0 for one in found.values()]
+        ax.errorbar(means, list(found), xerr=spread, fmt="o", ms=4, lw=1.2, capsize=2.5, color=curve_style(0)["color"])
+        ax.set_title(score, fontsize=9, loc="left")
+        ax.set_xlabel("percent, mean ± standard deviation over seeds", fontsize=8)
+    for ax in axes.flat:
+        ax.set_yticks(places, names if ax is cost else [""] * len(names))
+        ax.set_ylim(len(names) - 0.5, -0.5)
+        ax.tick_params(labelsize=7)
+        ax.grid(alpha=0.3, lw=0.5)
+        ax.set_axisbelow(True)
+    return save_figure(figure, path)
+
+
 def run(out: Path, *, queries: tuple[int, ...] = QUERIES, seconds: float = 8.0) -> dict[str, Any]:
-    """Run the benchmark, print its table and write `masking_variants.json` and `.md` into `out`; return the record.
+    """Run the benchmark, print its table and write `masking_variants.json`, `.md` and `.png`; return the record.
 
     Args:
         out: folder.
@@ -144,6 +186,10 @@ def run(out: Path, *, queries: tuple[int, ...] = QUERIES, seconds: float = 8.0) 
     text = speed_and_scores(record["queries"], record["scores"])
     print(text)
     save(out, "masking_variants", record, text)
+    written = [out / "masking_variants.md"]
+    if importlib.util.find_spec("matplotlib") is not None:
+        written.append(save_picture(out / "masking_variants.png", record["queries"], record["scores"]))
+    print(f"\n{written_to(written)}")
     return record
 
 

@@ -145,6 +145,20 @@ def command_line(
 
 
 def save(out: Path, name: str, record: dict[str, Any], table: str) -> None:
-    """Write `name`.json and `name`.md into the folder `out`."""
+    """Write `name`.json and `name`.md into the folder `out`; say so where other programs disturbed the times."""
     write_json(out / f"{name}.json", record)
     write_text(out / f"{name}.md", table + "\n")
+    if notice := load_notice(record):
+        print(f"\n{notice}")
+
+
+def load_notice(record: Mapping[str, Any]) -> str:
+    """Return a sentence if the cores were busier than a benchmark alone keeps them, by what `machine` says, or none."""
+    of = record.get("machine", record)
+    load, count = of.get("load", [0.0])[0], of.get("cores", 0)
+    if load <= count + 0.5:  # the benchmark itself counts
+        return ""
+    return (
+        f"Other programs ran (load {load:.1f} on {count} cores): times are too high, and so are those beside "
+        "quoted ones. Ratios of programs that ran in turn stay meaningful."
+    )

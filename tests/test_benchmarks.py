@@ -1,6 +1,7 @@
 """The arithmetic of the benchmarks; no test asserts a time."""
 
 import importlib
+import importlib.util
 import json
 import math
 import subprocess
@@ -21,7 +22,7 @@ from benchmarks import (
     paper_sizes,
 )
 from benchmarks.gpu import matching, side_by_side, steps
-from benchmarks.timing import command_line, compile_jax, interleave, markdown_table, summarise
+from benchmarks.timing import command_line, compile_jax, interleave, load_notice, markdown_table, summarise
 from tests.shared import ROOT
 from tflane_jax.ablations.paper.tf_lane import MASKING
 from tflane_jax.config import WorldData, load_config
@@ -98,6 +99,11 @@ def test_speed_and_accuracy_of_masks_stand_in_one_table(tmp_path):
     table = masking_variants.speed_and_scores(timings, scores).splitlines()
     assert [cell.strip() for cell in table[2].split("|")[1:-1]] == [variants[0], "2.00 ms", "1last", "1last"]
     assert [cell.strip() for cell in table[3].split("|")[1:-1]] == [variants[1], "1.50", "2last", "2last"]
+    if importlib.util.find_spec("matplotlib"):
+        spread = {name: dict.fromkeys(masking_variants.SCORES, "45.3 ± 0.2") for name in variants[1:]}
+        for shown in ({}, spread):
+            path = masking_variants.save_picture(tmp_path / "masks.png", timings, shown)
+            assert path.stat().st_size > 2000
     del scores[variants[1]]
     assert masking_variants.speed_and_scores(timings, scores).splitlines()[3].count(" - ") == 2
 
@@ -210,6 +216,13 @@ def test_an_update_is_planned_for_devices_that_a_cpu_plays(tmp_path):
     assert shared["exchanges"]["all-gather"][1] >= shared["parameters"]
     assert shared["arguments"] < 0.6 * whole["arguments"]
     assert "Estimate, not a measurement" in (tmp_path / "collectives.md").read_text()
+
+
+def test_a_busy_machine_is_named():
+    assert load_notice({"load": [1.9, 0.1, 0.1], "cores": 2}) == load_notice({}) == ""
+    busy = {"load": [6.94, 0.1, 0.1], "cores": 2}
+    for record in (busy, {"machine": busy, "results": []}):
+        assert "load 6.9 on 2 cores" in load_notice(record)
 
 
 def test_table_is_aligned():

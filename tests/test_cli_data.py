@@ -108,11 +108,29 @@ def test_a_table_may_be_named_with_its_suffix(command, out):
     assert build_parser().parse_known_args([*command.split(), "--out", "run-step2.5"])[0].out == Path("run-step2.5")
 
 
+def test_data_show_draws_what_a_setting_of_the_world_does(tmp_path, capsys):
+    show = ["data", "show", "--count", "1", "--split", "test", "--data.world.mirrored"]
+    pictures = [tmp_path / f"{fraction}.png" for fraction in "01"]
+    for path in pictures:
+        assert main([*show, path.stem, "--config", "tf_lane/toponet_tfm", "--out", str(path)]) == 0
+    assert pictures[0].read_bytes() != pictures[1].read_bytes()
+    capsys.readouterr()
+    assert main([*show, "1", "--data", "street"]) == 2
+    assert "--data.world.mirrored changes the configuration's world, not --data street" in capsys.readouterr().err
+
+
 @pytest.mark.slow
 def test_data_show_draws_world_cameras(tmp_path, capsys):
     assert main(["data", "show", "--data", "world-cameras", "--count", "1", "--out", str(tmp_path / "world.png")]) == 0
     assert {path.name for path in tmp_path.iterdir()} == {"world.png", "world-cameras.png"}
     assert "traffic lights and signs" in capsys.readouterr().out
+
+
+def test_a_split_of_the_world_stands_beside_all_recorded_logs(tmp_path, capsys):
+    """The command of docs/real_roads.md: recordings have no splits, so that --split is the world's."""
+    command = ["data", "stats", "--data", "street", "--split", "val", "--count", "1"]
+    assert main([*command, "--beside", f"recorded={tmp_path / 'absent'}"]) == 2
+    assert "there is no" in capsys.readouterr().err
 
 
 def test_distributions_of_several_data_are_laid_side_by_side(tmp_path, capsys):

@@ -10,6 +10,7 @@ import jax
 import pytest
 
 from tflane_jax.cli import OneLineWarnings, main
+from tflane_jax.commands.train import score_table
 from tflane_jax.datasets.base import TruncationWarning
 
 
@@ -88,3 +89,12 @@ def test_where_results_go_is_checked_before_anything_is_read(command, tmp_path, 
     assert main([*command.split(), "--out", "file/out"]) == 2
     said = capsys.readouterr().err
     assert said == f"tflane: cannot write file/out: {tmp_path}/file is no folder; choose another path\n"
+
+
+def test_the_scores_of_a_training_are_a_table_with_a_row_for_each_group_of_lanes():
+    scores = {"all/DET_l": 0.25, "all/recall": 0.5, "all/recall@1.0": 0.1, "clear/recall": 0.75, "loss": 3.0}
+    lines = score_table(scores, "last evaluation").splitlines()
+    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[2:]]
+    assert lines[0] == "last evaluation"
+    assert cells[0] == ["of", "DET_l", "recall", "loss"]
+    assert cells[2:] == [["all", "0.250", "0.500", "3.000"], ["clear", "-", "0.750", "-"]]

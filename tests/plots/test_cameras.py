@@ -26,7 +26,7 @@ def test_two_rows_for_each_example_with_truth_or_predictions(tmp_path):
     one = imread(save_camera_views(tmp_path / "one.png", jax.tree.map(lambda leaf: leaf[:1], EXAMPLES)))
     found = imread(save_camera_views(tmp_path / "found.png", EXAMPLES, LANES, ELEMENTS, titles=["a", "b"]))
     assert truth.shape == found.shape
-    assert truth.shape[0] == 2 * one.shape[0]
+    assert 0 < 2 * one.shape[0] - truth.shape[0] < 60  # both have one legend
     assert (truth != found).any()
 
 

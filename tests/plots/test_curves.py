@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tflane_jax.errors import UserError
-from tflane_jax.plots.curves import curves, save_comparison_curves, save_curves
+from tflane_jax.plots.curves import BANDS, curves, save_comparison_curves, save_curves
 
 pytest.importorskip("matplotlib")
 from matplotlib.figure import Figure
@@ -44,15 +44,16 @@ def test_a_panel_holds_a_group_and_a_band_holds_the_seeds(tmp_path, figures):
     drawn = [ax for ax in figures[0].axes if ax.axison]
     assert [ax.get_title(loc="left") for ax in drawn] == [
         "train: loss",
-        "train: learning_rate",
         "val: all",
         "val: occluded",
+        "train: learning_rate",
     ]
     assert [line.get_label() for line in drawn[0].lines] == ["loss", "points"]
     assert drawn[0].get_yscale() == "log"
-    np.testing.assert_allclose(drawn[2].lines[0].get_ydata(), [0.2, 0.5])
-    heights = drawn[2].collections[0].get_paths()[0].vertices[:, 1]
+    np.testing.assert_allclose(drawn[1].lines[0].get_ydata(), [0.2, 0.5])
+    heights = drawn[1].collections[0].get_paths()[0].vertices[:, 1]
     assert (heights.min(), heights.max()) == (0.1, 0.6)
+    assert figures[0].get_supxlabel() == "line: mean over 2 seeds; band: from the least to the greatest"
 
 
 def test_legends_lie_beside_the_curves(tmp_path, figures):
@@ -61,6 +62,28 @@ def test_legends_lie_beside_the_curves(tmp_path, figures):
     (ax,) = figures[0].axes
     assert ax.get_legend().get_window_extent().x0 >= ax.get_window_extent().x1
     assert len(ax.get_legend().get_texts()) == 9
+
+
+def test_errors_and_losses_do_not_squeeze_the_scores(tmp_path, figures):
+    record = {"all/AP_ls": 0.1, "all/AE_dist": 1.2, "all/AE_type": 0.4, "all/loss": 30.0, "clear/AP_ls": 0.2}
+    save_curves(tmp_path / "curves.png", [{"step": 1, "split": "val"} | record])
+    panels = {ax.get_title(loc="left"): [str(line.get_label()) for line in ax.lines] for ax in figures[0].axes}
+    assert panels == {
+        "val: all": ["AP_ls"],
+        "val: all, errors (lower is better)": ["AE_dist", "AE_type"],
+        "val: all, loss": ["loss"],
+        "val: clear": ["AP_ls"],
+    }
+
+
+def test_a_score_has_one_colour_in_all_panels_and_zero_is_at_the_bottom(tmp_path, figures):
+    record = {"all/AP": 0.1, "all/recall": 0.5, "clear/recall": 0.6, "hidden/recall": 0.0}
+    save_curves(tmp_path / "curves.png", [{"step": step, "split": "val"} | record for step in (1, 2)])
+    recall = [line.get_color() for ax in figures[0].axes for line in ax.lines if line.get_label() == "recall"]
+    assert len(recall) == 3
+    assert len(set(recall)) == 1
+    (hidden,) = [ax for ax in figures[0].axes if ax.get_title(loc="left") == "val: hidden"]
+    assert hidden.get_ylim() == (0.0, 1.0)
 
 
 def test_scores_have_a_linear_axis_and_those_of_single_thresholds_are_left_out(tmp_path, figures):
@@ -76,11 +99,16 @@ def test_a_model_has_one_colour_in_all_panels(tmp_path, figures):
     lanes, segments = ([[{"step": 1, "split": "val"} | scores]] for scores in ({"a": 1.0, "b": 0.001}, {"b": 0.5}))
     save_comparison_curves(tmp_path / "curves.png", {"segments": segments, "lanes": lanes}, ["a", "b"])
     first, second = figures[0].axes
+    assert second.get_title(loc="left") == "validation: b, percent"
+    np.testing.assert_allclose(second.lines[1].get_ydata(), [0.1])
     colours = {line.get_label(): line.get_color() for line in second.lines}
     assert len(set(colours.values())) == 2
     assert first.lines[0].get_color() == colours["lanes"]
     (legend,) = figures[0].legends
-    shown = dict(zip([text.get_text() for text in legend.get_texts()], legend.get_lines(), strict=True))
+    assert legend.get_title().get_text() == BANDS
+    texts = [text.get_text() for text in legend.get_texts()]
+    assert sorted(texts) == ["lanes (1 run)", "segments (1 run)"]
+    shown = dict(zip([text.partition(" (")[0] for text in texts], legend.get_lines(), strict=True))
     assert {name: line.get_color() for name, line in shown.items()} == colours
     assert legend.get_window_extent().y1 <= second.get_window_extent().y0
 

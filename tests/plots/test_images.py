@@ -4,7 +4,14 @@ import numpy as np
 import pytest
 
 from tests.models.images import road_images
-from tflane_jax.plots.images import lanes_drawn, predicted_lines, save_photo, save_road_images
+from tflane_jax.plots.images import (
+    LANE_COLOURS,
+    TRUTH,
+    lanes_drawn,
+    predicted_lines,
+    save_photo,
+    save_road_images,
+)
 from tflane_jax.scene import CurvePrediction
 
 
@@ -74,4 +81,17 @@ def test_images_without_predictions_share_rows(tmp_path, count, across, down):
         assert picture.size == (across * 528, pytest.approx(down * (528 * height / width + 27.5), abs=2))
     prediction = CurvePrediction(logits=np.tile([0.0, 1.0], (count, 3, 1)), curves=np.full((count, 3, 8), 0.5))
     with Image.open(save_road_images(tmp_path / "beside.png", images, {"a": prediction})) as picture:
-        assert picture.size == (2 * 528, pytest.approx(count * (528 * height / width + 27.5), abs=2))
+        legend = 27.5
+        assert picture.size == (2 * 528, pytest.approx(count * (528 * height / width + 27.5) + legend, abs=2))
+
+
+def test_no_predicted_lane_looks_like_the_truth(tmp_path):
+    pytest.importorskip("matplotlib")
+    from tests.plots.test_style import lab
+
+    everybody = np.eye(3)
+    truth = lab(TRUTH, everybody)
+    assert min(np.linalg.norm(lab(colour, everybody) - truth) for colour in LANE_COLOURS) > 40.0
+    images, answers = road_images(2), CurvePrediction(logits=np.zeros((2, 7, 2)), curves=np.zeros((2, 7, 8)))
+    for predictions in (None, {"model": answers}):
+        assert save_road_images(tmp_path / "roads.png", images, predictions).stat().st_size > 1000

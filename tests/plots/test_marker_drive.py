@@ -96,3 +96,10 @@ def test_the_label_of_a_board_lies_in_the_image(side, tmp_path, monkeypatch):
     box, frame = label.get_window_extent(), panel.get_window_extent()
     assert frame.x0 - 1 <= box.x0 <= box.x1 <= frame.x1 + 1
     assert frame.y0 - 1 <= box.y0 <= box.y1 <= frame.y1 + 1
+
+
+def test_the_title_says_whether_there_are_lanes_and_from_where():
+    some = NO_LANES.replace(valid=np.ones(1, bool), gate=np.array(0.7))
+    titles = [marker_drive.frame_title(4, some, remembered=remembered) for remembered in (False, True)]
+    assert titles == ["frame 4: lanes of a board in sight, c = 0.70", "frame 4: lanes from memory, c = 0.70"]
+    assert marker_drive.frame_title(4, NO_LANES, remembered=False) == "frame 4: no lanes of a board"

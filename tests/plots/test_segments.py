@@ -10,6 +10,7 @@ from tflane_jax.plots import Findings, save_camera_views, save_differences, save
 from tflane_jax.plots.bev import draw_found, draw_prediction, draw_scene
 from tflane_jax.plots.cameras import draw_camera, draw_projected, legend_entries
 from tflane_jax.plots.figure import new_figure
+from tflane_jax.plots.legends import above_entries
 from tflane_jax.plots.segments import (
     LINE_STYLES,
     boundary_types,
@@ -134,6 +135,10 @@ def test_the_legend_of_camera_images_names_what_is_drawn():
     assert names[:4] == ["solid boundary", "dashed boundary", "unmarked boundary", "crossing"]
     assert names[4:] == ["lane ahead", "to the left", "back", "to the right"]
     assert [entry.get_label() for entry in legend_entries(None)] == names[4:]
+    above = [entry.get_label() for entry in above_entries(fake_segments(), with_segments())]
+    assert above == ["truth, in predictions", "predicted lane (fainter: unsure)", "predicted topology"]
+    truth = [entry.get_label() for entry in above_entries(None, with_segments())]
+    assert truth == ["ground out of sight", "lane in sight", "lane out of sight"]
 
 
 def test_pages_show_segments(tmp_path):

@@ -38,7 +38,8 @@ def save_effects(
             "Difference: the claim's model minus the row. From, to: 95 % interval over scenes (seeds averaged,",
             f"{SAMPLES:,} bootstrap samples, {SHARED_SAMPLES} of scores that rank detections); seeds from, to: 95 %",
             "t interval over seeds. Neither is corrected for several claims. p: two-sided paired t-test over seeds;",
-            "Holm: corrected for all differences of one measure and checkpoint.",
+            "Holm: corrected for all differences of one measure and checkpoint. The table has fractions,",
+            "the sentences points: 0.01 is one point.",
         ]
         if no_drives:
             lines.append(f"Remark: {no_drives}: the intervals are too narrow.")

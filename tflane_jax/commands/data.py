@@ -30,10 +30,15 @@ _PRINTED = 50  # faults, and entries skipped
 _FORMAT = "argoverse2"  # of `data check`, by default
 
 
-def show(options: argparse.Namespace) -> int:
+def show(options: argparse.Namespace, overrides: Sequence[str]) -> int:
     """Draw samples of a split, and print counts of their content."""
     check_writable(options.out)
-    config = RunConfig() if options.config is None else load_config(options.config)
+    config = apply_overrides(RunConfig() if options.config is None else load_config(options.config), overrides)
+    worlds = [override for override in overrides if override.startswith("--data.world")]
+    if options.data is not None and worlds:
+        raise UserError(
+            f"{worlds[0]} changes the configuration's world, not --data {options.data}: leave one of them out"
+        )
     if options.data is not None and sources.named_source(options.data).example is RoadImage:
         config = _images(config)
     source = chosen_source(config, options)
@@ -50,8 +55,8 @@ def show(options: argparse.Namespace) -> int:
         shape = {"ground": source.example.ground, "view": source.example.range}
         written.append(save_camera_views(path, seen, titles=[names[i] for i in shown], **shape))
     title = f"{data_name(source, options)}: {_drawn(len(indices), 'example')}"
-    print(format_table(dataset_summary(examples), title=title))
-    print("\nwritten to", *written)
+    print(format_table(dataset_summary(examples), title=title, digits=2))
+    print(f"\n{written_to(written)}")
     return 0
 
 

@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from tflane_jax.commands.sources import chosen_source
 from tflane_jax.config import RunConfig
-from tflane_jax.datasets import argoverse2, sources
+from tflane_jax.datasets import argoverse2, recorded_logs, sources
 from tflane_jax.datasets.base import ExampleConfig
 from tflane_jax.datasets.recorded_logs import RECORDED_EXAMPLE
 from tflane_jax.errors import UserError
@@ -47,7 +47,8 @@ def beside(config: RunConfig, options: argparse.Namespace) -> int:
     for text in options.beside:
         name, _, root = text.partition("=")
         openlane = options.openlane if name == _READS_OPENLANE else None
-        source = chosen_source(config, _with(options, data=name, root=root or None, openlane=openlane))
+        split = None if name == recorded_logs.SOURCE.name else options.split  # a folder of recordings has no splits
+        source = chosen_source(config, _with(options, data=name, root=root or None, openlane=openlane, split=split))
         _check(source)
         chosen[_unused(name, chosen)] = replace(source, example=_same(first.example, source))
     values, counts = {}, {}

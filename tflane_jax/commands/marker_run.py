@@ -44,7 +44,7 @@ from tflane_jax.markers.reader import MarkerReader, ReaderConfig
 from tflane_jax.markers.store import MarkerStore, StaleMarkerWarning, UnknownMarkerWarning
 from tflane_jax.markers.store_files import load_store, save_store
 from tflane_jax.plots import format_table
-from tflane_jax.plots.marker_drive import board_outline, save_drive_frame
+from tflane_jax.plots.marker_drive import board_outline, frame_title, save_drive_frame
 from tflane_jax.progress import progress_bar
 from tflane_jax.runs import open_run
 from tflane_jax.scene import CameraViews
@@ -141,7 +141,7 @@ def _follow(
                 None if step.prediction is None else lanes_of(step.prediction),
                 view=view,
                 names=names,
-                title=f"frame {number}, {'remembered' if step.remembered else 'seen'}, c = {step.guidance.gate:.2f}",
+                title=frame_title(number, step.guidance, remembered=step.remembered),
                 threshold=options.threshold,
             )
     return frames, outcomes

@@ -6,8 +6,9 @@ import argparse
 import contextlib
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import jax
 
@@ -18,6 +19,7 @@ from tflane_jax.config_io import from_json, to_json, to_text
 from tflane_jax.config_overrides import apply_overrides, batch_notices
 from tflane_jax.errors import UserError
 from tflane_jax.own_modules import imports_of
+from tflane_jax.plots.tables import format_table
 from tflane_jax.runs import resumable_config, train_run
 from tflane_jax.startup import write
 from tflane_jax.training.runtime import configure_jax
@@ -64,11 +66,26 @@ def _trained(options: argparse.Namespace, overrides: Sequence[str]) -> int:
     print(
         f"{out}: {result.step} steps, {result.steps_per_second:.2f} steps/s, compiled in {result.compile_seconds:.1f} s"
     )
-    for name, value in result.metrics.items():
-        if "@" not in name:  # scores at single thresholds are in metrics.jsonl only
-            print(f"  {name} = {value:.4f}")
+    if result.metrics:
+        several = f", mean of {len(config.training.seeds)} seeds" if len(config.training.seeds) > 1 else ""
+        print("\n" + score_table(result.metrics, f"last evaluation, validation split{several}") + "\n")
+    if (out / "curves.png").exists():
+        print(f"pictures: {out / 'curves.png'}, {out / 'pictures'}")
     print(f"evaluate with: tflane eval {out}{own}")
     return 0
+
+
+def score_table(metrics: Mapping[str, float], title: str) -> str:
+    """Return scores by "group/name" as a table with a row for each group.
+
+    Scores at single thresholds ("recall@1.0") are left out: they are in metrics.jsonl.
+    """
+    groups: dict[str, dict[str, Any]] = {}
+    for name, value in metrics.items():
+        group, _, score = name.rpartition("/")
+        if "@" not in score:
+            groups.setdefault(group or "all", {})[score] = value
+    return format_table([{"of": group} | scores for group, scores in groups.items()], title=title)
 
 
 def _config(options: argparse.Namespace, out: Path, overrides: Sequence[str]) -> RunConfig:

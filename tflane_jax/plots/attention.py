@@ -23,6 +23,8 @@ def draw_temporal_mask(ax: Axes, frame_valid: Bool[Array, "t n"]) -> None:
 def draw_spatial_mask(ax: Axes, mask: Bool[Array, "s s"], lanes: int, *, title: str = "spatial mask $M_s$") -> None:
     """Draw M_s, (L+T, L+T), as the four quadrants L->L, L->T, T->L, T->T. Light: row attends to column.
 
+    To leave padding out, give rows and columns of valid tokens alone.
+
     Args:
         ax: where to draw.
         mask: true where attention is allowed.
@@ -46,6 +48,8 @@ def draw_spatial_mask(ax: Axes, mask: Bool[Array, "s s"], lanes: int, *, title: 
                 color="black",
                 bbox={"facecolor": "white", "alpha": 0.8, "lw": 0, "pad": 1.5},
             )
+    ax.set_xlabel("is attended to (key)", fontsize=8)
+    ax.set_ylabel("attends (query)", fontsize=8)
     ax.set_aspect("equal")
 
 

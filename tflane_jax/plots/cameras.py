@@ -16,8 +16,8 @@ from tflane_jax.geometry.polylines import resample_lines
 from tflane_jax.plots import style
 from tflane_jax.plots.bev import GROUND, VIEW, draw_found, draw_scene, truth_layers
 from tflane_jax.plots.figure import new_figure, save_figure
-from tflane_jax.plots.gallery import boundary_entries
 from tflane_jax.plots.images import draw_image
+from tflane_jax.plots.legends import above_entries, boundary_entries, truth_entry
 from tflane_jax.plots.lines import valid_rows
 from tflane_jax.plots.map_lines import chosen_lines, class_entries
 from tflane_jax.plots.segments import LanePrediction, boundary_types, chosen_areas, chosen_segments
@@ -61,6 +61,8 @@ _POINTS = 201
 _DASHES = {LineType.NONE: (0.5, 2.0), LineType.SOLID: None, LineType.DASHED: (2.5, 5.0)}
 # Lanes are cut off at this depth, metres.
 _NEAR = 0.5
+# Entries of a legend in a row.
+_ENTRIES = 7
 # Images smaller than this are shown with sharp pixels.
 _PIXELATED = 400
 
@@ -113,7 +115,7 @@ def save_camera_views(
     ahead, back = _rows_of_cameras(first.cameras)
     columns = max(len(ahead) + 1, len(back))
     height, width = examples.cameras.image.shape[2:4]
-    figure, axes = new_figure(2 * count, columns, panel=(_PANEL, _PANEL * min(height / width, 0.8) + 0.25))
+    figure, axes = new_figure(2 * count, columns, panel=(_PANEL, _PANEL * min(height / width, 0.8) + 0.25), footer=0.45)
     for ax in axes.flat:
         ax.set_axis_off()
     for row, title in enumerate(titles):
@@ -127,7 +129,12 @@ def save_camera_views(
         above.set_axis_on()
         _draw_above(above, example, found, title, threshold, ground, view)
     entries = legend_entries(lanes)
-    figure.legend(handles=entries, loc="outside lower center", ncols=len(entries), fontsize=7, frameon=False)
+    for entry in above_entries(lanes, examples):
+        entry.set_label(f"from above: {entry.get_label()}")
+        entries.append(entry)
+    rows = -(-len(entries) // _ENTRIES)
+    columns = -(-len(entries) // rows)
+    figure.legend(handles=entries, loc="outside lower center", ncols=columns, fontsize=7, frameon=False)
     return save_figure(figure, path)
 
 
@@ -280,6 +287,8 @@ def _draw_above(
     ground: PerceptionRange,
     view: PerceptionRange,
 ) -> None:
+    ax.set_xlabel("x, forward [m]", fontsize=7, labelpad=1.0)
+    ax.set_ylabel("y, left [m]", fontsize=7, labelpad=1.0)
     if lanes is None:
         true = truth_layers(None) if example.map_lines is None else ("map_lines",)
         layers = ("hidden", *true, "traffic", "elements")
@@ -293,7 +302,7 @@ def legend_entries(lanes: LanePrediction | None) -> list:
     from matplotlib.lines import Line2D
 
     if isinstance(lanes, LinePrediction):
-        return class_entries()
+        return [*class_entries(), truth_entry()]
     names = ("lane ahead", "to the left", "back", "to the right")
     colours = _direction_colours(np.array([0.0, 0.5, 1.0, -0.5]) * np.pi)
     ways = [Line2D([], [], color=colour, lw=1.5, label=name) for colour, name in zip(colours, names, strict=True)]

@@ -11,7 +11,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from tflane_jax.errors import UserError
-from tflane_jax.plots.figure import hide_unused, new_figure, save_figure
+from tflane_jax.plots import style
+from tflane_jax.plots.figure import columns_for, hide_unused, new_figure, save_figure
+from tflane_jax.plots.tables import counted
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -19,13 +21,20 @@ if TYPE_CHECKING:
 # Fields of a record that are not curves.
 _NOT_DRAWN = ("step", "split", "seconds", "waiting")
 
+# Beginnings of the names of errors among the scores: LaneSegNet's AE_dist (metres) and AE_type, TuSimple's FP and FN.
+_ERRORS = ("AE_", "FP", "FN")
+
+BANDS = "line: mean over runs; band: from the least to the greatest"
+
 Series = tuple[Int[np.ndarray, " n"], Float[np.ndarray, "n seeds"]]
 
 
 def save_curves(path: Path, records: Iterable[Mapping[str, Any]]) -> Path:
     """Write one panel per split and group of values ("loss", "loss/points": group "loss"), and return the path.
 
-    Several seeds are drawn as their mean and a band from minimum to maximum. Scores at single thresholds
+    Of scores, errors and losses have panels of their own, because they are metres or larger than 1.
+    The loss comes first, then the scores, then the rest of the training's records. Several seeds are drawn as their
+    mean and a band from minimum to maximum. Scores at single thresholds
     ("recall@1.0") are left out. Values of training have a logarithmic axis if they span more than a factor of 30.
 
     Args:
@@ -37,15 +46,22 @@ def save_curves(path: Path, records: Iterable[Mapping[str, Any]]) -> Path:
     series = {key: values for key, values in curves(records).items() if "@" not in key[1]}
     if not series:
         raise UserError("no curves to draw: the run has no records yet")
-    groups: dict[tuple[str, str], list[str]] = {}
-    for split, name in series:
-        groups.setdefault((split, name.split("/")[0]), []).append(name)
-    columns = min(3, len(groups))
-    figure, axes = new_figure(-(-len(groups) // columns), columns, panel=(4.6, 3.2))
-    for ax, ((split, group), names) in zip(axes.flat, groups.items(), strict=False):
-        ax.set_title(f"{split}: {group}" if split else group, fontsize=9, loc="left")
+    groups: dict[tuple[str, str, str], list[str]] = {}
+    for split, name in sorted(series, key=_place):
+        groups.setdefault((split, name.split("/")[0], _kind(split, name)), []).append(name)
+    seeds = max(values.shape[1] for _, values in series.values())
+    columns = columns_for(len(groups))
+    footer = 0.2 if seeds > 1 else 0.0
+    figure, axes = new_figure(-(-len(groups) // columns), columns, panel=(4.6, 3.2), footer=footer)
+    if seeds > 1:
+        figure.supxlabel(BANDS.replace("runs", f"{seeds} seeds"), fontsize=8)
+    # A score has one colour in all panels.
+    scores = _styles(dict.fromkeys(name.partition("/")[2] for split, name in series if split == "val"))
+    for ax, ((split, group, kind), names) in zip(axes.flat, groups.items(), strict=False):
+        ax.set_title((f"{split}: {group}" if split else group) + kind, fontsize=9, loc="left")
         found = {name.removeprefix(f"{group}/"): series[split, name] for name in names}
-        _draw_panel(ax, found, _styles(found), log=split == "train")
+        own = scores if scores.keys() >= found.keys() else _styles(found)
+        _draw_panel(ax, found, own, log=split == "train")
         if list(found) != [group]:
             # Beside the panel, because there are curves everywhere in it.
             ax.legend(fontsize=7, frameon=False, loc="upper left", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.0)
@@ -58,9 +74,13 @@ def save_comparison_curves(
 ) -> Path | None:
     """Write a panel for each score with a curve for each model: the mean over its runs, a band from least to most.
 
+    Scores are drawn in percent, as the tables show them. The legend says what lines and bands are, and how many runs a
+    model has.
+
     Args:
         path: .png, .pdf or .svg.
-        records: of the validation split, by model and run; only steps that all runs of a model have are drawn.
+        records: fractions, of the validation split, by model and run; only steps that all runs of a model have are
+            drawn.
         names: scores, such as "all/recall"; those without records are left out.
 
     Returns:
@@ -71,21 +91,47 @@ def save_comparison_curves(
     for name in names:
         for model, runs in found.items():
             if runs and all(("val", name) in run for run in runs):
-                panels.setdefault(name, {})[model] = _joined([run["val", name] for run in runs])
+                steps, values = _joined([run["val", name] for run in runs])
+                panels.setdefault(name, {})[model] = steps, 100.0 * values
     if not panels:
         return None
-    columns = min(3, len(panels))
-    figure, axes = new_figure(-(-len(panels) // columns), columns, panel=(4.6, 3.2), footer=0.1 + 0.1 * len(found))
+    columns = columns_for(len(panels))
+    size = (3.7, 2.7)  # three fit beside each other on a page whose text can still be read
+    figure, axes = new_figure(-(-len(panels) // columns), columns, panel=size, footer=0.3 + 0.1 * len(found))
     styles = _styles(found)  # the same in all panels
     for ax, (name, series) in zip(axes.flat, panels.items(), strict=False):
-        ax.set_title(f"validation: {name}", fontsize=9, loc="left")
+        ax.set_title(f"validation: {name}, percent", fontsize=9, loc="left")
         _draw_panel(ax, series, styles)
     hide_unused(axes, len(panels))
-    shown = {line.get_label(): line for ax in axes.flat for line in ax.lines}
+    lines = {str(line.get_label()): line for ax in axes.flat for line in ax.lines}
+    number = {model: values.shape[1] for series in panels.values() for model, (_, values) in series.items()}
     figure.legend(
-        shown.values(), shown, loc="outside lower center", ncols=min(len(shown), 2), fontsize=8, frameon=False
+        lines.values(),
+        [f"{model} ({counted(number[model], 'run')})" for model in lines],
+        title=BANDS,
+        loc="outside lower center",
+        ncols=min(len(lines), 2),
+        fontsize=8,
+        title_fontsize=8,
+        frameon=False,
     )
     return save_figure(figure, path)
+
+
+def _place(key: tuple[str, str]) -> int:
+    """Return a number by which curves are sorted: first the loss, then scores, then what explains a bad training."""
+    split, name = key
+    if split != "train":
+        return 1
+    return 0 if name.split("/")[0] == "loss" else 2
+
+
+def _kind(split: str, name: str) -> str:
+    """Return what the title of a panel says of the kind of a score: nothing where higher is better."""
+    score = name.rpartition("/")[2]
+    if split != "val":
+        return ""
+    return ", loss" if score == "loss" else ", errors (lower is better)" if score.startswith(_ERRORS) else ""
 
 
 def _joined(runs: Sequence[Series]) -> Series:
@@ -109,11 +155,7 @@ def curves(records: Iterable[Mapping[str, Any]]) -> dict[tuple[str, str], Series
 
 
 def _styles(names: Iterable[str]) -> dict[str, dict[str, Any]]:
-    """Return a colour and a line style for each curve; matplotlib's ten colours come again with other lines."""
-    return {
-        name: {"color": f"C{number % 10}", "linestyle": ("-", "--", ":")[number // 10 % 3]}
-        for number, name in enumerate(names)
-    }
+    return {name: style.curve_style(number) for number, name in enumerate(names)}
 
 
 def _draw_panel(
@@ -130,6 +172,8 @@ def _draw_panel(
     seen = seen[np.isfinite(seen)]
     if log and len(seen) and seen.min() > 0.0 and seen.max() > 30.0 * seen.min():
         ax.set_yscale("log")
+    if not seen.any():
+        ax.set_ylim(0.0, 1.0)  # nothing found: zero is at the bottom, not in the middle
     ax.set_xlabel("step", fontsize=8)
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     ax.tick_params(labelsize=7)

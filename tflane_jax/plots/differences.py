@@ -14,11 +14,12 @@ from tflane_jax.geometry import PerceptionRange
 from tflane_jax.plots import style
 from tflane_jax.plots.bev import GROUND, VIEW, Layer, draw_found, draw_scene, truth_layers
 from tflane_jax.plots.figure import new_figure, save_figure
-from tflane_jax.plots.gallery import (
+from tflane_jax.plots.gallery import label_edges, panel_size
+from tflane_jax.plots.legends import (
     boundary_entries,
-    label_edges,
-    panel_size,
+    hidden_entry,
     prediction_entries,
+    truth_entry,
     visibility_entries,
 )
 from tflane_jax.plots.map_lines import class_entries
@@ -141,18 +142,17 @@ def band(line: Float[np.ndarray, "n 2"], half_width: float) -> Float[np.ndarray,
 
 
 def _add_legend(figure: Figure, caption: str, meaning: str, *, drawn: Collection[Layer]) -> None:
-    from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
     edge = {"edgecolor": style.OUTLINE, "lw": 1.3}
     car = style.ROAD_USER[RoadUser.CAR]
     entries: list = [  # column by column
         Patch(facecolor="none", label=meaning, **edge),
-        Line2D([], [], color="#b0b3ba", lw=1, label="truth, in predictions"),
+        truth_entry(),
         Patch(facecolor=style.OUTLINE + "4d", label="this model finds it", **edge),
         Patch(facecolor="none", ls="--", label="this model misses it", **edge),
         *(class_entries() if "map_lines" in drawn else [*prediction_entries(), *visibility_entries()]),
-        Patch(facecolor="#0f1116", edgecolor=style.HATCH, hatch="////", lw=0, label="ground out of sight"),
+        hidden_entry(),
         Patch(facecolor=car + "8c", edgecolor=car, label="road user, its track"),
         Patch(facecolor="none", edgecolor=car, label="not seen at present"),
         *(

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from tflane_jax.plots import style
 from tflane_jax.plots.figure import hide_unused, new_figure, save_figure
 
 _BINS = 24
@@ -24,28 +25,32 @@ def save_distributions(path: Path, values: Mapping[str, Mapping[str, Float[np.nd
         path: .png, .pdf or .svg.
         values: by dataset, by quantity; quantities that a dataset lacks or has no value of are left out.
     """
+    from matplotlib.lines import Line2D
+
     names = list(dict.fromkeys(name for found in values.values() for name in found))
     columns = min(4, max(len(names), 1))
-    figure, axes = new_figure(max(-(-len(names) // columns), 1), columns, panel=(3.2, 2.3))
+    figure, axes = new_figure(max(-(-len(names) // columns), 1), columns, panel=(3.2, 2.3), footer=0.3)
     for ax, name in zip(axes.flat, names, strict=False):
         every = np.concatenate([found[name] for found in values.values() if name in found])
         low, high = float(every.min(initial=0.0)), float(np.quantile(every, _SHOWN)) if len(every) else 1.0
         whole = bool(np.all(every == np.round(every)))
         edges = _edges(low, high, whole=whole)
-        for number, (dataset, found) in enumerate(values.items()):
+        for number, found in enumerate(values.values()):
             if len(found.get(name, ())):
                 count, _ = np.histogram(np.clip(found[name], edges[0], edges[-1]), edges)
-                ax.stairs(count / len(found[name]), edges, color=f"C{number}", lw=1.3, label=dataset)
-        ax.set_title(name, fontsize=8, loc="left")
-        if whole and high - low < _TICKS:
+                ax.stairs(count / len(found[name]), edges, color=style.curve_style(number)["color"], lw=1.3)
+        ax.set_title(name.removeprefix("- "), fontsize=8, loc="left")  # the dash indents a row of a table
+        if set(every.tolist()) == {0.0, 1.0}:
+            ax.set_xticks([0, 1], ["no", "yes"])
+        elif whole and high - low < _TICKS:
             ax.set_xticks(np.arange(low, high + 1))
         ax.tick_params(labelsize=6)
         ax.grid(alpha=0.3, lw=0.5)
-    if names:
-        axes.flat[0].legend(fontsize=6, frameon=False)
     for ax in axes[:, 0]:
         ax.set_ylabel("fraction", fontsize=7)
     hide_unused(axes, len(names))
+    entries = [Line2D([], [], **style.curve_style(number), label=name) for number, name in enumerate(values)]
+    figure.legend(handles=entries, loc="outside lower center", ncols=len(values), fontsize=9, frameon=False)
     return save_figure(figure, path)
 
 

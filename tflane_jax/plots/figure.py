@@ -7,12 +7,13 @@ from __future__ import annotations
 
 import io
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from tflane_jax.errors import UserError, missing_extra
 from tflane_jax.files.atomic import replacing
+from tflane_jax.plots import style
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -44,12 +45,40 @@ def new_figure(
 
             picture, small = io.BytesIO(), io.BytesIO()
             self.savefig(picture, dpi=90, format="png")
-            colours = Image.open(picture).convert("RGB").quantize(256, dither=Image.Dither.NONE)
+            colours = _in_256_colours(Image.open(picture).convert("RGB"))
             colours.save(small, "png", optimize=True)
             return small.getvalue()
 
     figure = NotebookFigure((columns * panel[0], rows * panel[1] + footer), layout="constrained")
-    return figure, figure.subplots(rows, columns, squeeze=False)
+    axes = figure.subplots(rows, columns, squeeze=False)
+    for ax in axes.flat:
+        ax.set_prop_cycle(color=style.SERIES)
+    return figure, axes
+
+
+def _in_256_colours(picture: Any) -> Any:
+    """Return a PIL image with a palette: half of it for the commonest colours, exactly, half to cover the others.
+
+    By default PIL counts pixels, so that the grains of the evidence take nearly all colours, and a legend shows a bus
+    in brown; colours that cover all, alone, merge lines of a curve.
+    """
+    from PIL import Image
+
+    red, green, blue = np.moveaxis(np.asarray(picture, np.uint32), -1, 0)
+    found, place, counts = np.unique(red << 16 | green << 8 | blue, return_inverse=True, return_counts=True)
+    colours = np.stack([found >> 16, found >> 8 & 255, found & 255], -1).astype(np.float32)
+    common = colours[np.argsort(-counts, kind="stable")[:128]]
+    covering = picture.quantize(256 - len(common), Image.Quantize.MAXCOVERAGE, kmeans=1).getpalette()
+    palette = np.concatenate([common, np.reshape(covering, (-1, 3)).astype(np.float32)])[:256]
+    nearest = (np.square(palette).sum(-1) - 2.0 * colours @ palette.T).argmin(-1)  # PIL's own search is rough
+    shown = Image.fromarray(nearest.astype(np.uint8)[place].reshape(red.shape))
+    shown.putpalette(palette.astype(np.uint8).ravel().tolist())
+    return shown
+
+
+def columns_for(panels: int) -> int:
+    """Return the number of columns of a grid of curves: three, or two where the last row would hold a single panel."""
+    return min(panels, 2 if panels == 4 else 3)
 
 
 def save_figure(figure: Figure, path: Path, *, dpi: int = 110) -> Path:

@@ -13,13 +13,20 @@ from tflane_jax.geometry import PerceptionRange
 from tflane_jax.plots import style
 from tflane_jax.plots.bev import GROUND, VIEW, Layer, draw_found, draw_scene, truth_layers
 from tflane_jax.plots.figure import hide_unused, new_figure, save_figure
+from tflane_jax.plots.legends import (
+    boundary_entries,
+    crossing_entry,
+    hidden_entry,
+    prediction_entries,
+    truth_entry,
+    visibility_entries,
+)
 from tflane_jax.plots.map_lines import class_entries
-from tflane_jax.plots.segments import LINE_STYLES, LanePrediction
-from tflane_jax.scene import Example, LineType, row_of
+from tflane_jax.plots.segments import LanePrediction
+from tflane_jax.scene import Example, row_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-    from matplotlib.patches import Patch
 
     from tflane_jax.datasets.base import Dataset
 
@@ -152,7 +159,7 @@ def add_legend(
 
     entries: list = [
         *(class_entries() if "map_lines" in drawn else visibility_entries()),
-        Patch(facecolor="#0f1116", edgecolor=style.HATCH, hatch="////", lw=0, label="ground out of sight"),
+        hidden_entry(),
         *(Patch(facecolor=colour, label=user.name.lower()) for user, colour in style.ROAD_USER.items()),
         Patch(facecolor="none", edgecolor=style.OTHER_ELEMENT, label="road user not seen"),
         Line2D([], [], color=style.LIGHT[2], lw=0, marker="o", ms=4, mec="black", label="traffic light"),
@@ -163,9 +170,7 @@ def add_legend(
         ),
     ]
     if kind == "with predictions":
-        entries += [
-            Line2D([], [], color="#b0b3ba", lw=1, label="truth, in predictions"),
-        ]
+        entries.append(truth_entry())
         if "map_lines" not in drawn:
             entries += prediction_entries()
     if "segments" in drawn:
@@ -177,44 +182,6 @@ def add_legend(
     rows = -(-len(entries) // fitting)
     columns = -(-len(entries) // rows)
     figure.legend(handles=entries, loc="outside lower center", ncols=columns, fontsize=7, frameon=False)
-
-
-def visibility_entries() -> list:
-    """Return the entries of a legend for true lanes by what the sensor can see of them."""
-    from matplotlib.lines import Line2D
-
-    return [
-        Line2D([], [], color=style.LANE_CLEAR, lw=2, label="lane in sight"),
-        Line2D([], [], color=style.LANE_HIDDEN, lw=2, label="lane out of sight"),
-    ]
-
-
-def prediction_entries() -> list:
-    """Return the entries of a legend for predicted lanes and their topology."""
-    from matplotlib.lines import Line2D
-
-    return [
-        Line2D([], [], color=style.PREDICTION, lw=2, label="predicted lane"),
-        Line2D([], [], color=style.LINK, lw=1.2, marker="o", ms=3, label="predicted topology"),
-    ]
-
-
-def boundary_entries(colour: str = "#b0b3ba") -> list:
-    """Return the entries of a legend for boundaries by type, and for crossings."""
-    from matplotlib.lines import Line2D
-
-    names = {LineType.SOLID: "solid boundary", LineType.DASHED: "dashed boundary", LineType.NONE: "unmarked boundary"}
-    return [
-        *(Line2D([], [], color=colour, lw=1.2, ls=LINE_STYLES[kind], label=name) for kind, name in names.items()),
-        crossing_entry(),
-    ]
-
-
-def crossing_entry() -> Patch:
-    """Return the entry of a legend for crossings."""
-    from matplotlib.patches import Patch
-
-    return Patch(facecolor=style.CROSSING + "38", edgecolor=style.CROSSING, label="crossing")
 
 
 def panel_size(view: PerceptionRange, inches: float = _PANEL_WIDTH) -> tuple[float, float]:

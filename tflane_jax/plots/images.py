@@ -19,9 +19,10 @@ from tflane_jax.scene import CurvePrediction, LaneLines, RoadImage, row_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.lines import Line2D
 
-# Distinct colours for neighbouring lanes, all visible on asphalt.
-LANE_COLOURS = ("#ff4d6d", "#ffd166", "#4dd2ff", "#7ae582", "#c792ea", "#ff9d3c", "#f5f5f5")
+# Distinct colours for neighbouring lanes, all visible on asphalt; none is near the green of the truth.
+LANE_COLOURS = ("#ff4d6d", "#ffd166", "#4dd2ff", "#c792ea", "#ff9d3c", "#f5f5f5")
 TRUTH = "#8be28b"
 # Images in a row of a sheet without predictions.
 _COLUMNS = 4
@@ -58,7 +59,7 @@ def save_road_images(
     height, width = examples.image.shape[1:3]
     columns = 1 + len(predictions) if predictions else min(count, _COLUMNS)
     rows = count if predictions else -(-count // columns)
-    figure, axes = new_figure(rows, columns, panel=(4.8, 4.8 * height / width + 0.25))
+    figure, axes = new_figure(rows, columns, panel=(4.8, 4.8 * height / width + 0.25), footer=0.25 * bool(predictions))
     for row, (title, panels) in enumerate(zip(titles, axes.reshape(-1, 1 + len(predictions)), strict=False)):
         example, (truth, *others) = row_of(examples, row), panels
         draw_image(truth, example.image, f"{title}: truth")
@@ -68,7 +69,19 @@ def save_road_images(
             draw_lines(ax, example.lines, (height, width), width=0.9, style="--")
             draw_lanes(ax, predicted_lines(row_of(stacked, row), threshold) * [width, height])
     hide_unused(axes, count * (1 + len(predictions)))
+    if predictions:
+        figure.legend(handles=_entries(), loc="outside lower center", ncols=3, fontsize=8, frameon=False)
     return save_figure(figure, path)
+
+
+def _entries() -> list[Line2D]:
+    from matplotlib.lines import Line2D
+
+    return [
+        Line2D([], [], color=TRUTH, lw=1.6, label="truth"),
+        Line2D([], [], color=TRUTH, lw=0.9, ls="--", label="truth, in predictions"),
+        Line2D([], [], color=LANE_COLOURS[0], lw=2.2, label="prediction: a colour for each lane, left to right"),
+    ]
 
 
 def save_photo(

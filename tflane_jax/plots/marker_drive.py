@@ -81,7 +81,7 @@ def save_drive_frame(
         threshold: lowest score of predicted lanes.
     """
     shown = _cameras(views, detected)
-    figure, axes = new_figure(1, len(shown) + 1, panel=(4.4, 3.6))
+    figure, axes = new_figure(1, len(shown) + 1, panel=(4.4, 3.6), footer=0.3)
     for number, ax in zip(shown, axes[0], strict=False):
         name = names[number] if names else f"camera {number}"
         draw_boards(ax, views, number, detected, outcomes, confidence, guidance, title=name)
@@ -92,6 +92,8 @@ def save_drive_frame(
                 draw_projected(ax, small, number, found, colour=style.PREDICTION, width=0.9)
     above: Any = axes[0, -1]
     prepare(above, view, title)
+    above.set_xlabel("x, forward [m]", fontsize=8)
+    above.set_ylabel("y, left [m]", fontsize=8)
     draw_guidance(above, guidance)
     if prediction is not None:
         draw_prediction(above, prediction, threshold=threshold)
@@ -120,7 +122,31 @@ def save_drive_frame(
                 zorder=6.3,  # above the ego vehicle
             )
     draw_ego(above)
+    figure.legend(
+        handles=_entries(prediction is not None), loc="outside lower center", ncols=5, fontsize=7, frameon=False
+    )
     return save_figure(figure, path)
+
+
+def frame_title(number: int, guidance: MarkerGuidance, *, remembered: bool) -> str:
+    """Return what lanes of boards a frame has, and how far they are trusted, as title of its view from above."""
+    if not np.asarray(guidance.valid).any():
+        return f"frame {number}: no lanes of a board"
+    where = "from memory" if remembered else "of a board in sight"
+    return f"frame {number}: lanes {where}, c = {float(guidance.gate):.2f}"
+
+
+def _entries(predicted: bool) -> list[Any]:
+    from matplotlib.lines import Line2D
+
+    doubted, trusted = trust_colours(np.array([0.0, 1.0]))
+    lanes = {"lane of a board, c = 1": trusted, "c = 0": doubted} | (
+        {"predicted lane": style.PREDICTION} if predicted else {}
+    )
+    return [
+        Line2D([], [], color=OUTCOMES["used"], lw=0, marker="s", ms=5, label="board, its id and c"),
+        *(Line2D([], [], color=colour, lw=2, label=label) for label, colour in lanes.items()),
+    ]
 
 
 def draw_boards(

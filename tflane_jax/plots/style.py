@@ -1,8 +1,17 @@
-"""Colours of the pictures; each has one meaning throughout the project. Backgrounds are dark."""
+"""Colours of the pictures; each has one meaning throughout the project. Scenes have a dark background, curves a white
+one.
+"""
 
 from __future__ import annotations
 
+from typing import Any
+
 from tflane_jax.scene import BevChannel, LineClass, RoadUser
+
+# Curves of several models, on white. Okabe and Ito's colours (Color Universal Design, 2008) without their yellow:
+# people who see no difference between red and green tell them apart.
+SERIES = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00", "#000000")
+_DASHES = ("-", "--", ":")
 
 ROAD = "#1b1f27"
 GRID = "#39404d"
@@ -50,3 +59,11 @@ ROAD_USER = {
 # OpenLane-V2 attributes of a traffic light; any other state or element is drawn in grey.
 LIGHT = {1: "#ff3b30", 2: "#34c759", 3: "#ffcc00"}
 OTHER_ELEMENT = "#c8ccd4"
+
+
+def curve_style(number: int) -> dict[str, Any]:
+    """Return colour and line style of a curve by its number; the colours come again with other lines."""
+    return {
+        "color": SERIES[number % len(SERIES)],
+        "linestyle": _DASHES[number // len(SERIES) % len(_DASHES)],
+    }

@@ -7,7 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from tflane_jax.plots.figure import hide_unused, new_figure, save_figure
+from tflane_jax.plots import style
+from tflane_jax.plots.figure import columns_for, hide_unused, new_figure, save_figure
+from tflane_jax.plots.tables import counted
 
 Scores = Mapping[str, Sequence[Sequence[Mapping[str, float]]]]
 """By model: for each value of the setting, for each seed, metrics by name."""
@@ -15,6 +17,8 @@ Scores = Mapping[str, Sequence[Sequence[Mapping[str, float]]]]
 
 def save_sweep(path: Path, scores: Scores, setting: str, values: Sequence[str], metrics: Sequence[str]) -> Path:
     """Write one panel per metric: for each model the mean of its seeds and a band of one standard deviation.
+
+    The legend says what the bands are, and how many seeds a model has.
 
     Args:
         path: .png, .pdf or .svg.
@@ -26,21 +30,31 @@ def save_sweep(path: Path, scores: Scores, setting: str, values: Sequence[str], 
         places, ticks = np.array([float(value) for value in values]), None
     except ValueError:
         places, ticks = np.arange(len(values), dtype=float), values
-    columns = min(3, len(metrics))
-    figure, axes = new_figure(-(-len(metrics) // columns), columns, panel=(4.2, 2.9))
+    columns = columns_for(len(metrics))
+    figure, axes = new_figure(-(-len(metrics) // columns), columns, panel=(3.7, 2.7), footer=0.5)
     for ax, metric in zip(axes.flat, metrics, strict=False):
         for number, (model, by_value) in enumerate(scores.items()):
             percent = [100.0 * np.array([each[metric] for each in seeds]) for seeds in by_value]
             mean = np.array([seeds.mean() for seeds in percent])
             spread = np.array([seeds.std(ddof=1) if len(seeds) > 1 else 0.0 for seeds in percent])
-            ax.plot(places, mean, color=f"C{number}", marker="o", ms=3, lw=1.4, label=model)
-            ax.fill_between(places, mean - spread, mean + spread, color=f"C{number}", alpha=0.15, lw=0)
+            look = style.curve_style(number)
+            label = f"{model} ({counted(max(map(len, by_value)), 'seed')})"
+            ax.plot(places, mean, **look, marker="o", ms=3, lw=1.4, label=label)
+            ax.fill_between(places, mean - spread, mean + spread, color=look["color"], alpha=0.15, lw=0)
         ax.set_title(f"{metric}, percent", fontsize=9, loc="left")
-        ax.set_xlabel(setting.rpartition(".")[2].replace("_", " "), fontsize=8)
+        ax.set_xlabel(setting, fontsize=8)
         if ticks is not None:
             ax.set_xticks(places, ticks)
         ax.tick_params(labelsize=7)
         ax.grid(alpha=0.3, lw=0.5)
-    axes.flat[0].legend(fontsize=7, frameon=False)
     hide_unused(axes, len(metrics))
+    figure.legend(
+        handles=axes.flat[0].lines,
+        title="line: mean over seeds; band: one standard deviation up and down",
+        loc="outside lower center",
+        ncols=min(len(scores), 4),
+        fontsize=8,
+        title_fontsize=8,
+        frameon=False,
+    )
     return save_figure(figure, path)

@@ -19,7 +19,14 @@ def data(commands) -> None:
 
 
 def _show(inner) -> None:
-    show = command(inner, "show", "draw samples of a dataset and count their content", module="data", function="show")
+    show = command(
+        inner,
+        "show",
+        "draw samples of a dataset and count their content",
+        module="data",
+        function="show",
+        epilog=OVERRIDES,
+    )
     show.add_argument(
         "--config", metavar="FILE[:NAME]", help="config file whose data to show (default: the built-in world)"
     )
@@ -28,6 +35,7 @@ def _show(inner) -> None:
     show.add_argument(
         "--out", metavar="FILE", type=Path, default=Path("samples.png"), help="picture (default samples.png)"
     )
+    show.set_defaults(takes_overrides=True)
 
 
 def _stats(inner) -> None:

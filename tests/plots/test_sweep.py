@@ -1,0 +1,25 @@
+"""Scores of several models over a setting."""
+
+import numpy as np
+import pytest
+
+from tflane_jax.plots.sweep import save_sweep
+
+pytest.importorskip("matplotlib")
+from matplotlib.figure import Figure
+
+SCORES = {"gated": [[{"r": 0.5}, {"r": 0.7}], [{"r": 0.4}, {"r": 0.4}]], "hard": [[{"r": 0.3}], [{"r": 0.2}]]}
+
+
+@pytest.mark.parametrize("values", [("0", "0.25"), ("rain", "fog")])
+def test_bands_and_seeds_are_explained(tmp_path, monkeypatch, values):
+    saved, savefig = [], Figure.savefig
+    monkeypatch.setattr(Figure, "savefig", lambda self, *a, **k: (saved.append(self), savefig(self, *a, **k)))
+    path = save_sweep(tmp_path / "sweep.png", SCORES, "data.world.severity", values, ["r"])
+    assert path.stat().st_size > 2000
+    (ax,) = saved[0].axes
+    assert (ax.get_title(loc="left"), ax.get_xlabel()) == ("r, percent", "data.world.severity")
+    np.testing.assert_allclose([line.get_ydata() for line in ax.lines], [[60, 40], [30, 20]])
+    (legend,) = saved[0].legends
+    assert [text.get_text() for text in legend.get_texts()] == ["gated (2 seeds)", "hard (1 seed)"]
+    assert "one standard deviation" in legend.get_title().get_text()

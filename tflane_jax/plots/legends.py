@@ -1,0 +1,72 @@
+"""Entries of legends: each layer of a picture has the same colour and name in all of them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from tflane_jax.plots import style
+from tflane_jax.plots.segments import LINE_STYLES, LanePrediction
+from tflane_jax.scene import Example, LinePrediction, LineType
+
+if TYPE_CHECKING:
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+
+def visibility_entries() -> list:
+    """Return the entries of a legend for true lanes by what the sensor can see of them."""
+    from matplotlib.lines import Line2D
+
+    return [
+        Line2D([], [], color=style.LANE_CLEAR, lw=2, label="lane in sight"),
+        Line2D([], [], color=style.LANE_HIDDEN, lw=2, label="lane out of sight"),
+    ]
+
+
+def truth_entry() -> Line2D:
+    """Return the entry of a legend for the truth below a prediction."""
+    from matplotlib.lines import Line2D
+
+    return Line2D([], [], color="#b0b3ba", lw=1, label="truth, in predictions")
+
+
+def prediction_entries() -> list:
+    """Return the entries of a legend for predicted lanes and their topology."""
+    from matplotlib.lines import Line2D
+
+    return [
+        Line2D([], [], color=style.PREDICTION, lw=2, label="predicted lane (fainter: unsure)"),
+        Line2D([], [], color=style.LINK, lw=1.2, marker="o", ms=3, label="predicted topology"),
+    ]
+
+
+def boundary_entries(colour: str = "#b0b3ba") -> list:
+    """Return the entries of a legend for boundaries by type, and for crossings."""
+    from matplotlib.lines import Line2D
+
+    names = {LineType.SOLID: "solid boundary", LineType.DASHED: "dashed boundary", LineType.NONE: "unmarked boundary"}
+    return [
+        *(Line2D([], [], color=colour, lw=1.2, ls=LINE_STYLES[kind], label=name) for kind, name in names.items()),
+        crossing_entry(),
+    ]
+
+
+def hidden_entry() -> Patch:
+    """Return the entry of a legend for ground out of sight."""
+    from matplotlib.patches import Patch
+
+    return Patch(facecolor="#0f1116", edgecolor=style.HATCH, hatch="////", lw=0, label="ground out of sight")
+
+
+def crossing_entry() -> Patch:
+    """Return the entry of a legend for crossings."""
+    from matplotlib.patches import Patch
+
+    return Patch(facecolor=style.CROSSING + "38", edgecolor=style.CROSSING, label="crossing")
+
+
+def above_entries(lanes: LanePrediction | None, examples: Example) -> list:
+    """Return the entries of a legend for the view from above, beside camera images that explain the rest."""
+    if lanes is None:
+        return [hidden_entry(), *([] if examples.map_lines is not None else visibility_entries())]
+    return [] if isinstance(lanes, LinePrediction) else [truth_entry(), *prediction_entries()]

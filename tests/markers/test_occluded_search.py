@@ -8,6 +8,10 @@ from tflane_jax.markers.image_search import DetectorConfig, find_markers
 from tflane_jax.markers.occluded_search import find_occluded
 from tflane_jax.markers.square_pose import marker_outline
 from tflane_jax.scene.marker_patterns import MarkerFamily
+from tflane_jax.world.cameras.ring import ARGOVERSE2_RING, CameraRigConfig
+from tflane_jax.world.cameras.sensor import render_cameras
+from tflane_jax.world.roads.markers import PlacementConfig
+from tflane_jax.world.simulate import WorldConfig, simulate
 
 cv2 = pytest.importorskip("cv2")
 
@@ -115,6 +119,15 @@ def test_rectangles_and_noise_hold_no_markers(seed):
             part[:] = shown[: part.shape[0], : part.shape[1]]
     grey = np.clip(grey + 5.0 * rng.standard_normal(grey.shape), 0, 255).astype(np.uint8)
     assert find_occluded(grey, ARUCO, 8.0) == []
+
+
+def test_an_arrow_on_a_traffic_sign_is_no_board():
+    """In a bright sky the sign has margin and border, and its arrow most cells of id 98."""
+    world = WorldConfig(duration_s=3.6, keyframes=4, markers=PlacementConfig(side="both", site="clear"))
+    rig = CameraRigConfig(cameras=ARGOVERSE2_RING[:1], scale=0.5, markers=True)
+    views = render_cameras(simulate(2000, world), 3, rig)
+    grey = cv2.cvtColor(views.image[0], cv2.COLOR_RGB2GRAY)
+    assert find_occluded(grey, ARUCO, 8.0, ids=(4, 29, 33, 44, 46, 49, 61, 92, 98)) == []
 
 
 @pytest.mark.parametrize("shape", [(5, 5), (40, 40)])

@@ -37,6 +37,7 @@ _SURE, _AHEAD, _SECOND, _WRONG = 0.8, (9.0, 4.0), 4.0, 4.0
 # Least fraction of a board's points that are as bright as printed; less is enough (dirt) if nearly all cells of margin
 # and border, and all inner ones but a few, read right.
 _EXPLAINED, _DIRTY, _CLEAN, _FEW = 0.72, 0.6, 0.85, 3
+_INNER = 0.63  # the same of inner cells in sight: 0.57 on signs with a bent arrow, 0.69 and more on damaged boards
 # From this fraction on, the corners are not searched again; how often they are below it.
 _CERTAIN, _AGAIN = 0.9, 4
 # Standard deviation of the blur of lens and pixels, pixels.
@@ -119,7 +120,8 @@ def _identify(
     if levels is None or again is None or (again.marker_id, again.turns) != (read.marker_id, 0):
         return None
     dirty = explained >= _DIRTY and levels.quality >= _CLEAN and again.wrong <= _FEW
-    if explained < _EXPLAINED and not dirty:
+    certain = explained >= _EXPLAINED or dirty
+    if not certain or _inner_explained(grey, final, cells, levels) < _INNER:
         return None
     return OccludedMarker(read.marker_id, final, again.wrong, explained)
 
@@ -221,6 +223,17 @@ def _explained(
     return _fraction_explained(*_fine(grey, corners, cells, 6), shaded)
 
 
+def _inner_explained(
+    grey: UInt8[np.ndarray, "h w"], corners: Float[np.ndarray, "4 2"], cells: Bool[np.ndarray, "n n"], levels: _Levels
+) -> float:
+    """Return the fraction of the points of inner cells in sight that are as bright as printed; 0 with none in sight."""
+    seen, board = _fine(grey, corners, cells, 6)
+    sight = ~_between_faults(levels.read)
+    sight[[0, 1, -2, -1]] = sight[:, [0, 1, -2, -1]] = False
+    right = _as_printed(seen, board, _best_shade(grey, corners, cells))
+    return float(right[np.kron(sight, np.ones((6, 6), bool))].mean()) if sight.any() else 0.0
+
+
 def _fine(
     grey: UInt8[np.ndarray, "h w"], corners: Float[np.ndarray, "4 2"], cells: Bool[np.ndarray, "n n"], fine: int
 ) -> tuple[Float[np.ndarray, "k k"], Float[np.ndarray, "k k"]]:
@@ -235,18 +248,22 @@ def _fine(
 def _fraction_explained(
     seen: Float[np.ndarray, "k k"], board: Float[np.ndarray, "k k"], shaded: Bool[np.ndarray, "m m"]
 ) -> float:
-    fine, right = len(seen) // len(shaded), 0
+    return float(_as_printed(seen, board, shaded).mean())
+
+
+def _as_printed(
+    seen: Float[np.ndarray, "k k"], board: Float[np.ndarray, "k k"], shaded: Bool[np.ndarray, "m m"]
+) -> Bool[np.ndarray, "k k"]:
+    """Return the points that are as bright as printed, in the shadow and out of it; none if either has no contrast."""
+    fine, right = len(seen) // len(shaded), np.zeros(seen.shape, bool)
     dark = np.kron(shaded, np.ones((fine, fine), bool))
     for side in (dark, ~dark) if shaded.any() else (~dark,):
         whites, blacks = seen[side & (board > 0.85)], seen[side & (board < 0.15)]
-        if not len(whites) or not len(blacks):
-            return 0.0
-        white, black = np.median(whites), np.median(blacks)
-        if white - black < CONTRAST:
-            return 0.0
-        off = np.abs(seen[side] - (black + (white - black) * board[side]))
-        right += np.count_nonzero(off < 0.2 * (white - black))
-    return right / seen.size
+        white, black = (np.median(some) if len(some) else np.nan for some in (whites, blacks))
+        if not white - black >= CONTRAST:
+            return np.zeros(seen.shape, bool)
+        right |= side & (np.abs(seen - (black + (white - black) * board)) < 0.2 * (white - black))
+    return right
 
 
 class _Levels(NamedTuple):

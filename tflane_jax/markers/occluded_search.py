@@ -226,12 +226,10 @@ def _explained(
 def _inner_explained(
     grey: UInt8[np.ndarray, "h w"], corners: Float[np.ndarray, "4 2"], cells: Bool[np.ndarray, "n n"], levels: _Levels
 ) -> float:
-    """Return the fraction of the points of inner cells in sight that are as bright as printed; 0 with none in sight."""
-    seen, board = _fine(grey, corners, cells, 6)
-    sight = ~_between_faults(levels.read)
-    sight[[0, 1, -2, -1]] = sight[:, [0, 1, -2, -1]] = False
-    right = _as_printed(seen, board, _best_shade(grey, corners, cells))
-    return float(right[np.kron(sight, np.ones((6, 6), bool))].mean()) if sight.any() else 0.0
+    """Return the fraction of the points of inner cells in sight, or else of all, that are as bright as printed."""
+    right = _as_printed(*_fine(grey, corners, cells, 6), _best_shade(grey, corners, cells))[12:-12, 12:-12]
+    sight = np.kron(~_between_faults(levels.read)[2:-2, 2:-2], np.ones((6, 6), bool))
+    return float(right[sight].mean() if sight.any() else right.mean())
 
 
 def _fine(

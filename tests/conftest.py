@@ -1,11 +1,13 @@
 """Settings of every test session, made before JAX starts."""
 
 import atexit
+import contextlib
 import gc
 import os
 import shutil
 import sys
 import tempfile
+from pathlib import Path
 
 from tests.fast_compile import compile_fast
 
@@ -50,6 +52,17 @@ def _search_path():
     before = list(sys.path)
     yield
     sys.path[:] = before
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _programs_in_memory():
+    """Drop compiled programs after a file once a worker holds 3 GiB: the whole session's would be 6."""
+    yield
+    with contextlib.suppress(FileNotFoundError):  # Linux alone says how much it holds
+        pages = int(Path("/proc/self/statm").read_text().split()[1])
+        if pages * os.sysconf("SC_PAGE_SIZE") > 3 * 2**30:
+            jax.clear_caches()
+            gc.collect()
 
 
 def pytest_collection_modifyitems(items):

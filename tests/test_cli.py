@@ -258,7 +258,7 @@ def test_several_seeds_are_evaluated_with_mean_and_deviation(config, tmp_path):
         (["eval", "RUN", "--checkpoint", "77"], "has no checkpoint of step 77, only 2, 4"),
         (["eval", "RUN", "--data", "argoverse2"], "needs --root"),
         (["eval", "RUN", "--root", "logs"], "add --data argoverse2"),
-        (["predict", "RUN", "--out", "RUN/config.json"], "cannot write to"),
+        (["predict", "RUN", "--out", "RUN/config.json"], "config.json is no folder"),
         (["predict", "RUN", "--count", "0", "--out", "x"], "nothing to predict"),
         (["bench", "--out", "RUN/config.json"], "config.json is no folder"),
         (["data", "check", "nowhere"], "there is no nowhere: name a folder of Argoverse 2 logs"),

@@ -117,10 +117,11 @@ def test_a_missing_package_is_no_fault_of_the_photos(predict, tmp_path, monkeypa
         ([], {"focal": 0.0}, "--focal is of photos"),
     ],
 )
-def test_options_without_effect_are_refused(monkeypatch, inputs, setting, said):
+def test_options_without_effect_are_refused(tmp_path, monkeypatch, inputs, setting, said):
     trained = SimpleNamespace(config=SimpleNamespace(task=LaneShapeTask()), name="model")
     monkeypatch.setattr(predict_command, "opened", lambda options: (trained, [Path(name) for name in inputs]))
-    options = dict.fromkeys(("threshold", "split", "data", "root", "openlane", "count", "focal", "horizon")) | setting
+    options = dict.fromkeys(("threshold", "split", "data", "root", "openlane", "count", "focal", "horizon"))
+    options |= {"out": tmp_path} | setting
     with pytest.raises(UserError, match=said):
         predict_command.run(Namespace(**options))
 

@@ -44,6 +44,7 @@ def aged(content):
     return old
 
 
+@pytest.mark.slow
 def test_folders_may_be_named_by_text(config, tmp_path):
     train_run(config, f"{tmp_path}/run", progress=False)
     assert open_run(f"{tmp_path}/run").step == open_run(tmp_path / "run").step

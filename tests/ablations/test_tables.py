@@ -174,6 +174,7 @@ def test_all_tables_are_checked_before_the_first_is_trained(tiny, tmp_path, monk
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_a_table_that_was_stopped_ends_with_the_same_bytes(tiny, tmp_path, monkeypatch):
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     run_table(small(tiny), range(2), whole)

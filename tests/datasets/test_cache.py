@@ -161,6 +161,7 @@ def test_altered_content_is_noticed_when_it_is_loaded(tmp_path):
         CachedDataset(entry.folder).arrays()
 
 
+@pytest.mark.slow
 def test_warnings_of_workers_are_those_of_the_build(tmp_path, monkeypatch, capfd):
     monkeypatch.setattr(parallel, "BLOCK", 2)
     with pytest.warns(TruncationWarning, match="more lanes than room"):

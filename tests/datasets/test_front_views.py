@@ -70,6 +70,7 @@ def test_a_loaded_split_holds_the_examples(monkeypatch):
     assert_same(load_road_images(SMALL, progress=False), loaded)
 
 
+@pytest.mark.slow
 def test_other_processes_make_the_same_bits():
     config = FrontViewConfig(split="test", images=26, world=_tiny())
     loaded, dataset = load_road_images(config, progress=False, workers=2), FrontViewDataset(config)

@@ -115,6 +115,7 @@ def test_outputs_and_gradients_are_those_of_the_definition(shapes, steps, monkey
     assert all(np.abs(leaf).max() > 0.1 for leaf in jax.tree.leaves(ours))
 
 
+@pytest.mark.slow
 def test_each_view_has_its_own_value_as_if_mapped():
     one = arrays()
     given = [jnp.stack([array, array[::-1]]) for array in one]

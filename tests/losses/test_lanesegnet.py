@@ -269,6 +269,7 @@ def test_published_class_losses_are_divided_by_the_rows_of_their_own_frame():
         np.testing.assert_array_equal(report[name], batch[name])
 
 
+@pytest.mark.slow
 def test_elements_count_as_matched_pairs_and_not_at_all_in_a_frame_without_any():
     """The map-element-bucket variant: its topology has the loss of the successors."""
     host = replace(SEGMENTS, decoder=replace(SEGMENTS.decoder, classes=1))

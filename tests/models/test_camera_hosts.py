@@ -177,6 +177,7 @@ def test_every_parameter_of_a_part_learns(toponet):
     assert {name for name in silent if not name.endswith("/key/bias")} == expected
 
 
+@pytest.mark.slow
 def test_dropout_follows_the_key(toponet):
     batch = batch_of(make_camera_example(8), make_camera_example(9))
     losses = [float(toponet.train(toponet.params, batch, jax.random.key(k))[0][0]) for k in (0, 0, 1)]

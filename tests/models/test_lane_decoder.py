@@ -84,6 +84,7 @@ def test_pointwise_refinement_starts_at_zero_and_looks_only_where_the_point_is()
     assert not np.allclose(before, after)
 
 
+@pytest.mark.slow
 def test_pointwise_refinement_sees_headings_in_metres():
     """Beside equal features, a lane moves alike in boxes of any shape."""
     config = BASELINE.decoder

@@ -82,6 +82,7 @@ def proposals(bev, lanes=None, mutable=(), config=DECODER):
     return module.apply(params, bev, lanes, mutable=list(mutable), rngs={"dropout": jax.random.key(2)})
 
 
+@pytest.mark.slow
 def test_queries_lie_on_the_lanes_of_their_cells_and_the_shape_head_sees_the_truth_only_in_training():
     bev = jax.random.normal(jax.random.key(0), (*SHAPE, 6))
     ((content, position, reference), state) = proposals(bev)

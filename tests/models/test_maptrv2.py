@@ -40,6 +40,7 @@ def trained(params, example):
     return found.lines, auxiliary_outputs(state)
 
 
+@pytest.mark.slow
 def test_the_second_group_exists_in_training_only_and_changes_nothing_else(params):
     """With traffic, whose module gets the groups as the host's own mask."""
     example = make_line_example()

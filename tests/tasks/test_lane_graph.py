@@ -54,6 +54,7 @@ def test_shipped_ranges_fit():
     RunConfig().task.check(WorldData(), EXAMPLES)
 
 
+@pytest.mark.slow
 def test_cells_beyond_a_capacity_are_counted():
     """Regression: nothing read the count; only the first training example was checked before the first step."""
     config = load_config("camera/toponet")
@@ -185,6 +186,7 @@ def test_limiting_instances_needs_traffic_flow():
         limit_instances(LaneGraphTask(BASELINE), 3)
 
 
+@pytest.mark.slow
 def test_the_matched_control_differs_from_the_treatment_by_the_traffic_alone():
     """The control of a comparison: the same parameters, no traffic in training and test."""
     treatment, example = LaneGraphTask(WITH_TRAFFIC), make_example()

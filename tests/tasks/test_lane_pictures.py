@@ -207,6 +207,7 @@ def test_hosts_of_different_lanes_are_not_compared(of_segments, monkeypatch):
         drawn_with(of_segments, models, monkeypatch)
 
 
+@pytest.mark.slow
 def test_training_and_comparing_segments_leave_pictures(of_segments, tmp_path):
     pytest.importorskip("matplotlib")
     task = KnowingSegments()

@@ -94,6 +94,7 @@ def test_predicts_one_class_and_one_curve_for_each_query(fitted):
     assert not np.array_equal(answer.logits, fitted.predict(fitted.params, road_image(1)).curves.logits)
 
 
+@pytest.mark.slow
 def test_padding_content_changes_nothing(fitted):
     clean, soiled = (padded(road_image(0), fill) for fill in (0, 200))
     answer = fitted.predict(fitted.params, clean)
@@ -223,6 +224,7 @@ def test_images_that_do_not_shrink_by_whole_blocks_are_named():
         LaneShapeTask(dataclasses.replace(tiny_model(), shrink=7)).check_settings(data)
 
 
+@pytest.mark.slow
 def test_the_validation_loss_does_not_depend_on_the_batch_size():
     """Images with many and few lanes, and one without any, whose lanes a loss of a batch would weigh together."""
     images = road_images(5)

@@ -149,6 +149,7 @@ def test_the_depth_network_is_told_the_scale_of_the_images():
         task.check_settings(dataclasses.replace(DATA, example=smaller))
 
 
+@pytest.mark.slow
 def test_pictures_of_training_and_of_a_comparison(tmp_path, monkeypatch):
     pytest.importorskip("matplotlib")
     monkeypatch.setattr("tflane_jax.datasets.sources.open_dataset", lambda *_, **__: dataset())

@@ -41,6 +41,7 @@ def start(folder, **environment):
     return int(hits)
 
 
+@pytest.mark.slow
 def test_the_second_process_finds_the_programs_of_the_first(tmp_path):
     assert start(tmp_path / "cache") == 0
     assert start(tmp_path / "cache") > 0
@@ -140,6 +141,7 @@ def test_64_bit_mode_is_refused():
         runtime.configure_jax(keep_programs=False)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="the settings are glibc's")
 @pytest.mark.parametrize("start", ["worker", *(pytest.param(name, marks=pytest.mark.slow) for name in _OTHERS)])
 def test_memory_of_one_step_is_used_by_the_next(tmp_path, start):

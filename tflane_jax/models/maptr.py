@@ -224,14 +224,14 @@ class MapTr(Host):
         """
         config, spec, (queries, position, reference) = self.config.decoder, self.config.spec, start
         (lines, points, dim), groups, outputs = queries.shape, self.groups(len(queries)), []
-        apart, sizes = same_group(groups), tuple(count * points for count in groups)
-        apart_by_point = None if apart is None else jnp.asarray(np.kron(apart, np.ones((points, points), bool)))
+        together, sizes = same_group(groups), tuple(count * points for count in groups)
+        points_together = None if together is None else jnp.asarray(np.kron(together, np.ones((points, points), bool)))
         for i in range(config.layers):
             placed = point_position(config, i, position, reference)
             spots = reference.reshape(lines * points, 1, -1)
-            flat = HostQueries(queries.reshape(-1, dim), placed.reshape(-1, dim), spots, apart_by_point, sizes)
+            flat = HostQueries(queries.reshape(-1, dim), placed.reshape(-1, dim), spots, points_together, sizes)
             queries = fuse_into_queries(self.priors.by_name, tokens, i, flat).reshape(queries.shape)
-            queries = self.attend(i, queries, placed, reference, bev, apart, deterministic)
+            queries = self.attend(i, queries, placed, reference, bev, together, deterministic)
             heads = LineHeads(config, spec.bev_range, spec.range, name=f"heads_{i}")
             outputs.append(heads(queries, reference))
             reference = lax.stop_gradient(outputs[-1].unit)
@@ -248,7 +248,7 @@ class MapTr(Host):
         placed: Float[Array, "i p c"],
         reference: Float[Array, "i p d"],
         bev: Float[Array, "h w e"],
-        apart: Bool[np.ndarray, "i i"] | None,
+        together: Bool[np.ndarray, "i i"] | None,
         deterministic: bool,
     ) -> Float[Array, "i p c"]:
         """Return the queries after a decoder layer: attention among all points, then to the BEV features around each.
@@ -258,7 +258,7 @@ class MapTr(Host):
             queries, placed: content of the queries and the position encoding added to it.
             reference: points in [0, 1].
             bev: BEV features.
-            apart: which line may attend to which; None: all to all.
+            together: which line may attend to which; None: all to all.
             deterministic: no dropout.
         """
         config = self.config.decoder

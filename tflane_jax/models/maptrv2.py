@@ -25,11 +25,7 @@ from tflane_jax.models.camera_encoder import CameraEncoderConfig
 from tflane_jax.models.host import Host
 from tflane_jax.models.lidar_axes import raster_in_ego_axes
 from tflane_jax.models.lift import LiftConfig
-from tflane_jax.models.map_lines import (
-    PAPER_LINE_DECODER,
-    LineDecoderConfig,
-    LineQueries,
-)
+from tflane_jax.models.map_lines import PAPER_LINE_DECODER, LineDecoderConfig, LineQueries
 from tflane_jax.models.maptr import PAPER_MAP_ENCODER, PAPER_RANGE, MapTr, MapTrConfig, turned
 from tflane_jax.models.priors import ByPrior
 from tflane_jax.scene import MapLines, Prediction
@@ -125,14 +121,11 @@ class MapTrV2(MapTr):
         first = self.config.decoder.queries
         return (first, lines - first) if lines > first else ()
 
-    def attend(self, layer, queries, placed, reference, bev, apart, deterministic):
+    def attend(self, layer, queries, placed, reference, bev, together, deterministic):
         """Return the queries after a decoder layer of decoupled attention; see `MapTr.attend`."""
         config = self.config.decoder
-        module, inputs = (
-            partial(DecoupledLayer, config, name=f"layer_{layer}"),
-            (queries, placed, reference, bev, apart),
-        )
-        return run_layer(self, module, config, *inputs, deterministic=deterministic)
+        module = partial(DecoupledLayer, config, name=f"layer_{layer}")
+        return run_layer(self, module, config, queries, placed, reference, bev, together, deterministic=deterministic)
 
 
 class DecoupledLayer(nn.Module):

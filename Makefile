@@ -9,7 +9,7 @@ STAMP := $(VENV)/.installed
 help:
 	@echo "make demo         set up, train with and without traffic flow on the built-in world, table and picture"
 	@echo "make test         set up, lint, run the tests (what CI runs)"
-	@echo "make test-slow    the tests that take minutes"
+	@echo "make test-slow    types, and the tests that take longer"
 	@echo "make lint         ruff (rules and format) and pyright"
 	@echo "make same-losses  train every configuration in this checkout and in BEFORE=../before, compare bit by bit"
 	@echo "make bench        the benchmarks, as JSON under runs/bench"
@@ -32,16 +32,16 @@ lint: $(STAMP)
 types: $(STAMP)
 	@if $(BIN)/pyright --version >/dev/null 2>&1; then $(BIN)/pyright; else echo "pyright skipped: it needs Node.js"; fi
 
-# Types are checked beside the tests, on whichever core has time; what they say comes last.
+PYTEST := $(BIN)/python -m pytest -q --numprocesses 2 --dist loadfile --no-loadscope-reorder --durations=15
+
 test: $(STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	@said=$$(mktemp); $(MAKE) --no-print-directory types >$$said 2>&1 & types=$$!; \
-	$(BIN)/python -m pytest -q --numprocesses 2 --dist loadfile --no-loadscope-reorder --durations=15; tests=$$?; \
-	wait $$types; typed=$$?; cat $$said; rm -f $$said; exit $$((tests > typed ? tests : typed))
+	$(PYTEST)
 
-test-slow: $(STAMP)
-	$(BIN)/python -m pytest -q -m slow --durations=15
+# Before a release. Types take a minute on two cores, which `make test` spends on tests.
+test-slow: types
+	$(PYTEST) -m slow
 
 # For a change that must not change a number: git worktree add ../before COMMIT, then for example
 # make same-losses BEFORE=../before NAMES="tf_lane camera.toponet" STEPS=20

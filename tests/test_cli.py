@@ -221,6 +221,7 @@ def test_a_whole_split_is_predicted_in_parts_and_scored(trained, tmp_path, monke
         assert scored["TOP_ll"] == pytest.approx(evaluated["TOP_ll"])
 
 
+@pytest.mark.slow
 def test_a_baseline_has_no_traffic_flow_to_limit(config, tmp_path, capsys):
     folder = tmp_path / "baseline"
     command = ["train", "--config", f"{config}:baseline", "--out", str(folder), "--training.steps", "2"]
@@ -231,6 +232,7 @@ def test_a_baseline_has_no_traffic_flow_to_limit(config, tmp_path, capsys):
     assert "without traffic flow" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_several_seeds_are_evaluated_with_mean_and_deviation(config, tmp_path):
     folder = tmp_path / "seeds"
     arguments = ["--training.seeds", "0", "1", "--training.steps", "2", *FEW_PICTURES]

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from tests.plots.test_map_lines import labelled, prediction
+from tests.slow import with_slow
 from tflane_jax.commands import predict_lanes
 from tflane_jax.config import RunConfig
 from tflane_jax.runs import Run
@@ -16,7 +17,7 @@ from tflane_jax.scene import Prediction, stack_examples
 pytest.importorskip("matplotlib")
 
 
-@pytest.mark.parametrize("truth", ["labelled", "derived"])
+@pytest.mark.parametrize("truth", with_slow(["labelled", "derived"], quick=["labelled"]))
 def test_prediction_of_lines(tmp_path, monkeypatch, capsys, truth):
     example, out = labelled(), tmp_path / "predictions"
     example = example if truth == "labelled" else example.replace(map_lines=None)

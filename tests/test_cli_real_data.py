@@ -65,6 +65,7 @@ def test_nuscenes_is_drawn_from_above_and_in_the_images_that_are_there(run, draw
     assert len(np.load(tmp_path / "out" / "predictions.npz")["points"]) == 2
 
 
+@pytest.mark.slow
 def test_argoverse_2_is_drawn_in_the_images_of_the_logs_that_have_some(run, drawn, tmp_path):
     """The model reads no images; one of two logs has some, at its first key frame."""
     ring = "ring_front_center", "ring_side_left"

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from tests.shared import ROOT
-from tests.slow import with_slow
 from tests.training.many_devices import BATCH, EVENLY, assignments, host_terms, in_parts, normalised, predicted
 from tests.training.stub_run import run
 from tests.training.test_loop import arrays, timeless
@@ -17,7 +16,7 @@ from tflane_jax.training.checkpoint import Checkpoints
 from tflane_jax.training.vectors import ROW
 
 
-@pytest.fixture(scope="module", params=with_slow([2, 8], quick=[2]))
+@pytest.fixture(scope="module", params=[pytest.param(count, marks=pytest.mark.slow) for count in (2, 8)])
 def forced(request, tmp_path_factory):
     """Return the folder of a process with so many devices, and what it says."""
     folder = tmp_path_factory.mktemp("devices")

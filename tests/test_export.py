@@ -37,6 +37,7 @@ def test_exported_program_equals_the_model_for_any_batch_size(model, exported, b
         np.testing.assert_allclose(answer[name], expected[name], rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_exported_program_runs_without_this_package(model, exported, tmp_path):
     np.save(tmp_path / "images.npy", images(2))
     code = (

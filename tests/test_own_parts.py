@@ -114,6 +114,7 @@ def test_shipped_parts_can_be_chosen_beside_own_ones():
     assert "HostConfig" not in choices(RunConfig(), "task.model")
 
 
+@pytest.mark.slow
 def test_an_own_encoder_of_evidence_is_built():
     encoder = PlainEncoderConfig(**{f.name: getattr(BASELINE.encoder, f.name) for f in fields(BASELINE.encoder)})
     params, prediction = shaped(LaneGraphTask(replace(BASELINE, encoder=encoder)), make_example(0))

@@ -10,8 +10,6 @@ from pathlib import Path
 
 import pytest
 
-from tests.slow import with_slow
-
 ROOT = Path(__file__).parents[1]
 HOSTS = {
     "lane graphs": ["toponet"],
@@ -27,7 +25,8 @@ HOSTS = {
 }
 
 
-@pytest.mark.parametrize("kind", with_slow(HOSTS, quick=("lane graphs",)))
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", HOSTS)
 def test_shapes_are_as_annotated(kind):
     command = [sys.executable, "-m", "tests.shape_checks", *HOSTS[kind]]
     environment = os.environ | {"JAX_PLATFORMS": "cpu"}

@@ -58,6 +58,7 @@ def _hold(folder, pipe):
         pipe.recv()
 
 
+@pytest.mark.slow
 def test_a_command_that_was_killed_leaves_its_core(tmp_path):
     context = multiprocessing.get_context("spawn")
     pipe, far = context.Pipe()

@@ -87,6 +87,7 @@ def test_a_failure_is_listed_where_its_log_cannot_be_written(tmp_path, capsys):
     assert "tflane: no space left" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_run_that_cannot_be_evaluated_stops_no_table(tiny, tmp_path, monkeypatch, capsys):
     """Regression: the picture opened the damaged run of the first seed again, before any table was written."""
     train_run = workers.train_run
@@ -186,6 +187,7 @@ def test_a_row_that_lacks_seeds_takes_none_from_another_row(tmp_path, capsys):
     assert "no paired tests (best checkpoint, test split): no two seeds with base" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_an_evaluation_that_fails_is_listed_too(tiny, tmp_path, monkeypatch, capsys):
     open_run = scores.open_run
 

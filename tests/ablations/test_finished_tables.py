@@ -32,6 +32,7 @@ def trained(tiny, tmp_path, monkeypatch):
     return tmp_path
 
 
+@pytest.mark.slow
 def test_all_runs_give_the_same_table_without_training(tiny, trained, monkeypatch, capsys):
     names = ("table.md", "effects.md", "summary.json", "comparison.json")
     before = {name: (trained / "paper.9" / name).read_bytes() for name in names}
@@ -45,6 +46,7 @@ def test_all_runs_give_the_same_table_without_training(tiny, trained, monkeypatc
     assert summary(trained)["devices"] == ["gpu: x"]
 
 
+@pytest.mark.slow
 def test_runs_that_are_missing_are_named_and_the_others_count(tiny, trained, monkeypatch, capsys):
     """Row tfm has seeds 0 and 1 then, the others seed 0; seed 2 is of none, so that the table does not name it."""
     plan = plan_table(small(tiny), range(3), trained).jobs

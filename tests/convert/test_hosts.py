@@ -186,7 +186,7 @@ CASES = {
 
 
 @pytest.mark.golden
-@pytest.mark.parametrize("name", with_slow(CASES, quick=["toponet", "maptrv2"]))
+@pytest.mark.parametrize("name", with_slow(CASES, quick=["maptrv2"]))
 def test_every_tensor_of_a_detector_has_its_place(name, tmp_path):
     model, make = CASES[name]
     state, path = make(), tmp_path / "weights.npz"

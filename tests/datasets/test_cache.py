@@ -282,6 +282,7 @@ def start(tmp_path: Path, pause: float) -> subprocess.Popen:
     return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
+@pytest.mark.slow
 def test_builders_at_the_same_time_build_once(tmp_path):
     builders = [start(tmp_path, 0.3) for _ in range(2)]
     outputs = [builder.communicate(timeout=60) for builder in builders]

@@ -11,12 +11,15 @@ from tests.converted import converted_params
 from tests.golden import batch_leading, case_id, golden_modules, load_module_case, options
 from tests.golden_compare import compare
 from tests.layers.batch_bugs import EXAMPLES, like_the_reference
+from tests.slow import with_slow
 from tflane_jax.convert.bevformer import SPATIAL_ATTENTION, TEMPORAL_ATTENTION
 from tflane_jax.layers.bev_attention import LOST, SpatialCrossAttention, TemporalSelfAttention, first_seen
 
 
 @pytest.mark.golden
-@pytest.mark.parametrize("path", golden_modules("tsa_*"), ids=case_id)
+@pytest.mark.parametrize(
+    "path", with_slow(golden_modules("tsa_*"), quick=["tsa_olv2_prev", "tsa_noprev_bs1"]), ids=case_id
+)
 def test_temporal_attention_matches_the_reference(path):
     check_temporal(load_module_case(path))
 
@@ -52,7 +55,7 @@ def leading(case, array):
 
 
 @pytest.mark.golden
-@pytest.mark.parametrize("path", golden_modules("sca_*"), ids=case_id)
+@pytest.mark.parametrize("path", with_slow(golden_modules("sca_*"), quick=["sca_bs2"]), ids=case_id)
 @pytest.mark.parametrize("compact", [False, True])
 def test_spatial_attention_matches_the_reference(path, compact):
     check_spatial(load_module_case(path), compact)

@@ -7,6 +7,7 @@ import pytest
 
 from tests.parameters import random_params
 from tests.shared import random_array
+from tests.slow import with_slow
 from tflane_jax.layers.polyline_encoder import PolylineEncoder, PolylineEncoderConfig
 
 
@@ -17,7 +18,7 @@ def encoder(attend, dropout=0.0):
     return module, random_params(module.init, points, labels, jnp.ones(3, bool)), points, labels
 
 
-@pytest.mark.parametrize("attend", ["lines", "points"])
+@pytest.mark.parametrize("attend", with_slow(["lines", "points"], quick=["points"]))
 def test_lines_that_are_not_valid_are_none_at_all_and_may_hold_anything(attend):
     module, params, points, labels = encoder(attend)
 
@@ -39,7 +40,7 @@ def test_lines_that_are_not_valid_are_none_at_all_and_may_hold_anything(attend):
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4), by_params, expected)
 
 
-@pytest.mark.parametrize("attend", ["lines", "points"])
+@pytest.mark.parametrize("attend", with_slow(["lines", "points"], quick=["points"]))
 def test_each_line_drops_features_of_its_own(attend):
     module, params, points, labels = encoder(attend, dropout=0.5)
     equal = jnp.broadcast_to(points[:1], points.shape), jnp.broadcast_to(labels[:1], labels.shape), jnp.ones(3, bool)

@@ -10,6 +10,7 @@ import pytest
 
 from tests.golden import case_id, golden_modules, implemented, load_module_case, options
 from tests.golden_compare import compare
+from tests.slow import with_slow
 from tflane_jax.convert.lstr import RESNET
 from tflane_jax.convert.renaming import convert
 from tflane_jax.layers.batch_norm import BATCH_AXIS
@@ -25,7 +26,7 @@ BLOCKS = {
 
 
 @pytest.mark.golden
-@pytest.mark.parametrize("path", golden_modules("resnet*"), ids=case_id)
+@pytest.mark.parametrize("path", with_slow(golden_modules("resnet*"), quick=["resnet18_train"]), ids=case_id)
 def test_matches_pytorch(path):
     check(load_module_case(path))
 

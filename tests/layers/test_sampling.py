@@ -60,6 +60,7 @@ def test_sample_reproduces_a_plane_and_its_slope():
     np.testing.assert_allclose(slope, [3.0, -2.0], rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_the_slope_at_a_cell_centre_is_that_to_the_next_cell():
     """The first locations of deformable attention lie there. Those of a grid of powers of two are exact in float32."""
     h, w = 4, 8

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from tests.slow import with_slow
 from tflane_jax.losses.areas import AreaLossConfig, area_loss, area_targets
 from tflane_jax.scene import AreaPrediction, Areas, AreaType
 
@@ -35,7 +36,7 @@ def loss(areas, prediction=None, **settings):
     return run(make_prediction() if prediction is None else prediction, areas)
 
 
-@pytest.mark.parametrize("shift", [1, 3])
+@pytest.mark.parametrize("shift", with_slow([1, 3], quick=[3]))
 def test_where_a_ring_starts_does_not_matter(shift):
     (whole, terms), (moved, others) = loss(make_areas()), loss(make_areas(shift=shift))
     np.testing.assert_allclose(moved, whole, rtol=1e-5)

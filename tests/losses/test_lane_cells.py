@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from tests.slow import with_slow
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.losses import lane_cells as losses
 from tflane_jax.losses.auxiliary import auxiliary_losses
@@ -109,7 +110,7 @@ def test_the_truth_has_the_least_loss():
     assert lane_cell_loss(perfect.at[..., 0].multiply(-1), lanes, RANGE) > 10.0
 
 
-@pytest.mark.parametrize("valid", [(), (0, 2), (0, 1, 2), (1, 3)])
+@pytest.mark.parametrize("valid", with_slow([(), (0, 2), (0, 1, 2), (1, 3)], quick=[(), (1, 3)]))
 def test_padding_after_the_last_valid_lane_of_a_batch_is_not_looked_at(valid):
     """All numbers are bit by bit those of a loop over every lane; the lanes that are left out may hold anything."""
     rng = np.random.default_rng(len(valid))

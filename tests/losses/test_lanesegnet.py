@@ -12,6 +12,7 @@ from tests.converted import converted_params
 from tests.golden import case_id, golden_modules, load_module_case, numbered
 from tests.golden_compare import compare
 from tests.models.cases import SEGMENTS, make_bucket_example, make_segment_example
+from tests.slow import with_slow
 from tflane_jax.convert.toponet import RELATIONSHIP
 from tflane_jax.layers.graph import RelationshipHead
 from tflane_jax.losses.costs import dice_cost, focal_cost, mask_cost
@@ -175,7 +176,7 @@ def test_a_mirrored_or_moved_scene_has_the_same_loss(motion, class_target):
         np.testing.assert_allclose(terms[name], value, rtol=1e-4, atol=1e-6, err_msg=name)
 
 
-@pytest.mark.parametrize("class_target", ["one", "quality"])
+@pytest.mark.parametrize("class_target", with_slow(["one", "quality"], quick=["quality"]))
 @pytest.mark.parametrize("counts", [(0, 0), (1, 0), (4, 1)])
 def test_any_number_of_targets_has_a_finite_gradient(counts, class_target):
     prediction, targets, masks = make_case(1, counts)
@@ -220,6 +221,7 @@ def test_a_perfect_prediction_costs_next_to_nothing_and_quality_falls_with_dista
     np.testing.assert_allclose(segment_quality(moved, lines), [1.0, 0.75, 0.875])
 
 
+@pytest.mark.slow
 def test_topology_counts_matched_pairs_of_lanes():
     logits = jnp.zeros((1, 3, 3))
     found = Assignment(jnp.array([[2, 0, 1, 0]]), jnp.array([[True, True, True, False]]))
@@ -254,6 +256,7 @@ def test_padding_of_the_examples_may_hold_nan():
     assert np.isfinite(clean[0])
 
 
+@pytest.mark.slow
 def test_published_class_losses_are_divided_by_the_rows_of_their_own_frame():
     """Classes, line types and topology, as of devices with one frame each; the other terms as of one batch."""
     case = make_case(counts=(2, 4, 1))

@@ -12,6 +12,7 @@ from tests.golden_compare import compare
 from tests.models.cases import LINES, make_line_example
 from tests.models.golden_maps import line_targets as golden_targets
 from tests.models.golden_maps import perception_range
+from tests.slow import with_slow
 from tflane_jax.datasets.map_geometry import MapGeometry
 from tflane_jax.datasets.map_lines import MapLinesConfig, crop_map_lines
 from tflane_jax.errors import UserError
@@ -128,7 +129,7 @@ def same_loss(prediction, lines, other, config):
 
 @pytest.mark.parametrize("rings", ["one", "both"])
 @pytest.mark.parametrize("coordinates", [2, 3])
-@pytest.mark.parametrize("steps", [1, 3])
+@pytest.mark.parametrize("steps", with_slow([1, 3], quick=[3]))
 def test_a_ring_may_start_anywhere_and_a_line_at_either_end(rings, coordinates, steps):
     prediction, lines = make_prediction(coordinates=coordinates), make_lines()
     config = MapTrLossConfig(rings=rings)
@@ -203,7 +204,7 @@ def test_the_order_of_queries_and_lines_does_not_matter():
             np.testing.assert_allclose(terms[name], value, rtol=1e-4, atol=1e-6, err_msg=name)
 
 
-@pytest.mark.parametrize("class_target", ["one", "quality"])
+@pytest.mark.parametrize("class_target", with_slow(["one", "quality"], quick=["quality"]))
 @pytest.mark.parametrize("counts", [(0, 0), (1, 0), (6, 1)])
 def test_any_number_of_lines_has_a_finite_gradient(counts, class_target):
     prediction, lines = make_prediction(1, 2), make_lines(1, counts)

@@ -23,6 +23,7 @@ from tflane_jax.models.bevformer import (
 from tflane_jax.scene import CameraViews
 
 
+@pytest.mark.slow
 def test_paper_size_has_the_published_parameters():
     shapes = ((100, 128), (50, 64), (25, 32), (13, 16))
     levels = [jax.ShapeDtypeStruct((7, *shape, 256), jnp.float32) for shape in shapes]
@@ -103,6 +104,7 @@ def memory():
 POSE = yaw_pose(np.float32(1.5), np.float32(-0.3), np.float32(0.2)).astype(np.float32)
 
 
+@pytest.mark.slow
 def test_a_valid_memory_changes_the_features_and_an_invalid_one_does_not(encode, variables, memory):
     with_memory = encode(levels(), ring(), memory, POSE)
     nothing = encode(
@@ -185,6 +187,7 @@ def test_gradients_do_not_depend_on_what_padding_holds(change):
     assert not np.asarray(by_features[0][1]).any()
 
 
+@pytest.mark.slow
 def test_capacity_and_rematerialisation_change_no_number(encode, variables, memory):
     most = int(seen_queries(CONFIG, ring()).max())
     assert 5 < most < 50

@@ -137,6 +137,7 @@ TERMS = {
 }
 
 
+@pytest.mark.slow
 def test_both_hosts_have_one_loss(fitted):
     batch = batch_of(make_camera_example(5), make_camera_example(6))
     (loss, report), gradient = jax.eval_shape(fitted.train, fitted.params, batch, jax.random.key(0))
@@ -213,6 +214,7 @@ def test_an_empty_scene_equals_no_traffic_flow(toponet):
     assert_same(answer, toponet.step(other, toponet.task.start(), absent)[1])
 
 
+@pytest.mark.slow
 def test_mismatched_parts_are_errors():
     task, key = TASKS["toponet"], jax.random.key(0)
     with pytest.raises(UserError, match="choose data with cameras"):
@@ -245,6 +247,7 @@ def without_memory():
     return LaneGraphTask(dataclasses.replace(CAMERA_TOPONET, encoder=off))
 
 
+@pytest.mark.slow
 def test_bev_memory_can_be_switched_off():
     """No frame leaves BEV features to the next, and the parameters are those of the host with memory."""
     task, example = without_memory(), make_camera_example()

@@ -24,7 +24,7 @@ def test_levels_keep_the_shape_of_the_features(shape):
     assert set(params["params"]) == {"stem", "stem_norm", "context"}
 
 
-@pytest.mark.parametrize(("levels", "far"), [((), False), ((16, 16), True)])
+@pytest.mark.parametrize(("levels", "far"), [pytest.param((), False, marks=pytest.mark.slow), ((16, 16), True)])
 def test_levels_give_context_from_the_whole_box(levels, far):
     config = EvidenceEncoderConfig(dim=8, levels=levels, dilations=(1,))
     bev = jax.random.randint(jax.random.key(1), (32, 64, 4), 0, 255).astype(jnp.uint8)

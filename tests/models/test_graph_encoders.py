@@ -38,7 +38,7 @@ CONFIGS = {
     "han meta-paths": HanEncoderConfig(1, hidden=16, semantic=8, relations=("near", "near+row", "row+column")),
 }
 # Each of these has a part that no other has; the slow ones have parts of several.
-QUICK = ("gtn every hop", "gtn similarity alone", "gcn", "han meta-paths")
+QUICK = ("gtn every hop", "gcn", "han meta-paths")
 PARAMETERS = {"gtn": 23_360, "gcn": 19_072, "han": 22_016}
 
 every_config = pytest.mark.parametrize("name", with_slow(CONFIGS, QUICK))
@@ -290,7 +290,9 @@ def test_dropout_is_seeded():
     assert float(jnp.abs(run(0) - apply(variables, *scene(), deterministic=True)).max()) > 0
 
 
-@pytest.mark.parametrize(("name", "attends"), [("gtn", True), ("gcn", False), ("han", True)])
+@pytest.mark.parametrize(
+    ("name", "attends"), [("gtn", True), ("gcn", False), pytest.param("han", True, marks=pytest.mark.slow)]
+)
 def test_dropout_reaches_attention_weights(name, attends):
     """As in the transformer's layer. The dropout that all layers have in common is left out."""
     module, variables = built(dataclasses.replace(CONFIGS[name], layers=1))

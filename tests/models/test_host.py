@@ -69,7 +69,7 @@ def predicted(task, params, example):
 
 
 # The other models differ from these in one setting of the traffic, or are these without it.
-QUICK = ("baseline", "traffic", "segments, traffic", "lines, traffic")
+QUICK = ("traffic", "segments, traffic")
 
 
 @cache
@@ -120,7 +120,7 @@ def test_an_empty_scene_equals_no_traffic_flow(name):
     assert not np.array_equal(absent.points, predict(params, example).points)
 
 
-@pytest.mark.parametrize("name", ["baseline", "segments", "lines"])
+@pytest.mark.parametrize("name", with_slow(["baseline", "segments", "lines"], quick=["segments"]))
 def test_baseline_does_not_depend_on_traffic(name):
     _, params, predict = fit(name)
     assert_same(predict(params, make_line_example(5)), predict(params, make_line_example(5).replace(traffic_flow=None)))

@@ -10,7 +10,6 @@ import pytest
 
 from tests.models.cases import BASELINE, make_example
 from tests.parameters import random_params
-from tests.slow import with_slow
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.losses.toponet import TopoNetLossConfig, lane_denoising_losses
 from tflane_jax.models.auxiliary import AUXILIARY
@@ -131,7 +130,8 @@ HOSTS = {
 }
 
 
-@pytest.mark.parametrize("name", with_slow(HOSTS, quick=("toponet",)))
+@pytest.mark.slow
+@pytest.mark.parametrize("name", HOSTS)
 def test_denoising_changes_only_the_loss(name):
     plain, noisy = (LaneGraphTask(replace(HOSTS[name], denoising=noise)) for noise in (None, DenoisingConfig()))
     params = random_params(noisy.init, make_example())

@@ -37,6 +37,7 @@ def decode(params, *, config=SEGMENTS, **options):
     return run(params)
 
 
+@pytest.mark.slow
 def test_masks_are_predicted_in_training_only_and_nothing_else_changes(params):
     training, evaluation = decode(params, deterministic=False), decode(params)
     assert training.mask_logits.shape == (2, 6, 4, 6)
@@ -47,6 +48,7 @@ def test_masks_are_predicted_in_training_only_and_nothing_else_changes(params):
         np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_the_published_evaluation_moves_only_the_last_layer_and_only_outside_training(params):
     twice = replace(SEGMENTS, last_step="twice")
     once, published = decode(params), decode(params, config=twice)
@@ -186,6 +188,7 @@ BUCKET = replace(SEGMENTS, decoder=replace(SEGMENTS.decoder, classes=1), areas=A
 """The map-element-bucket variant on BEV evidence; with cameras it has traffic elements as well."""
 
 
+@pytest.mark.slow
 def test_areas_are_predicted_apart_and_segments_have_one_class():
     module = BUCKET.build()
     params = random_params(lambda key: module.init(key, BEV, method=LaneSegNet.decode)["params"])

@@ -131,6 +131,7 @@ def test_depth_bins_are_whole(depth):
     check_settings(LiftConfig(depth=(1.0, 35.0, 0.1)), "")
 
 
+@pytest.mark.slow
 def test_kernels_start_as_published():
     """Xavier-uniform in the whole depth network; PyTorch's default in the heads of the masks."""
     cells, vector = jnp.zeros((1, 2, 3, 32)), jnp.zeros((1, 22))
@@ -196,6 +197,7 @@ class Shown(LiftEncoder):
         return cameras
 
 
+@pytest.mark.slow
 def test_the_depth_network_knows_cameras_by_their_native_images_and_the_vehicles_own_frame():
     """Images are half the size of the native ones; the rear axle lies 1.4 m ahead of the example's frame, turned."""
     raised = np.asarray(yaw_pose(np.float32(-1.4), np.float32(0.2), np.float32(0.1)), np.float32)
@@ -231,6 +233,7 @@ def test_cameras_may_change_places_and_a_missing_one_may_hold_anything():
     assert np.abs(one - bev).max() > 1e-3
 
 
+@pytest.mark.slow
 def test_an_absent_camera_is_none_at_all_in_training():
     """Norms of the batch: BEV features of one camera beside one that delivers nothing are those of the one."""
     views, features = make_views(), jax.random.normal(jax.random.key(0), (2, 4, 6, 8))

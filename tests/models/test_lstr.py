@@ -11,6 +11,7 @@ import pytest
 from tests.golden import case_id, golden_modules, load_module_case, numbered, options
 from tests.golden_compare import assert_outputs_close, compare
 from tests.shared import shared_path, shared_root
+from tests.slow import with_slow
 from tflane_jax.convert.lstr import convert_lstr
 from tflane_jax.datasets.tusimple import TuSimpleConfig, TuSimpleDataset
 from tflane_jax.evaluation.lane_shapes import detected, detections_of_curves
@@ -45,7 +46,7 @@ def tiny_config(case):
     return LstrConfig(backbone, sizes.attn, encoder, sizes.dec, layer, sizes.q)
 
 
-@pytest.mark.parametrize("path", of_kind("tiny"), ids=case_id)
+@pytest.mark.parametrize("path", with_slow(of_kind("tiny"), quick=["lstr_tiny_train"]), ids=case_id)
 def test_network_matches_the_reference(path):
     check_network(load_module_case(path))
 

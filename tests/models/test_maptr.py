@@ -10,6 +10,7 @@ import pytest
 
 from tests.models.cases import CAMERA, ELEMENTS, LINES, SMALL_LINES, make_camera_example, make_line_example
 from tests.parameters import random_params, zero_params
+from tests.slow import with_slow
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.layers.masks import SpatialMask
@@ -147,7 +148,7 @@ def test_it_trains_with_denoising_and_all_its_parameters_learn():
     assert not silent
 
 
-@pytest.mark.parametrize("attention", ["kernel", "deformable"])
+@pytest.mark.parametrize("attention", with_slow(["kernel", "deformable"], quick=["kernel"]))
 def test_cameras_may_change_places_but_for_their_embeddings(attention):
     encoder = replace(
         CAMERA,

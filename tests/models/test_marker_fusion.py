@@ -12,6 +12,7 @@ from jax import lax
 from tests.models.cases import BASELINE, CAMERA_TOPONET, WITH_TRAFFIC, make_camera_example, make_example
 from tests.parameters import random_params
 from tests.shared import assert_same
+from tests.slow import with_slow
 from tflane_jax.layers.masks import key_mask
 from tflane_jax.layers.polyline_encoder import PolylineEncoderConfig
 from tflane_jax.models.marker_fusion import (
@@ -303,7 +304,7 @@ def test_cells_beyond_the_radius_of_all_lanes_are_unchanged():
     assert not np.array_equal(out[0], jnp.ones(8))
 
 
-@pytest.mark.parametrize("encoding", ["sine", "transformer", "mlp"])
+@pytest.mark.parametrize("encoding", with_slow(["sine", "transformer", "mlp"], quick=["sine"]))
 @pytest.mark.parametrize("connectivity", [False, True])
 def test_tokens_are_scaled_and_belong_to_their_lane(encoding, connectivity):
     module = MarkerTokens(replace(CONFIG, encoding=encoding, connectivity=connectivity), BASELINE.spec.bev_range)

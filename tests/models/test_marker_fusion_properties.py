@@ -15,6 +15,7 @@ from tests.models.cases import BASELINE
 from tests.models.test_marker_fusion import CONFIG, observed, seeing
 from tests.parameters import random_params
 from tests.shared import assert_same
+from tests.slow import with_slow
 from tflane_jax.geometry import BevGrid, relative_pose, yaw_pose
 from tflane_jax.models.marker_fusion import (
     FusedMarkers,
@@ -69,7 +70,10 @@ def lanes_of(config, markers):
     return prior.observe(seeing(markers), prior.start())[0]
 
 
-@pytest.fixture(params=VARIANTS, scope="module")
+QUICK = ("gated", "as written", "radius", "hard", "connectivity", "MLP", "cells")
+
+
+@pytest.fixture(params=with_slow(VARIANTS, QUICK), scope="module")
 def variant(request):
     """Return a variant, with random parameters, and its function from lanes to BEV features."""
     config = VARIANTS[request.param]

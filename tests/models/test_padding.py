@@ -20,7 +20,6 @@ from tests.models.cases import (
 )
 from tests.models.test_parameters import BUCKET
 from tests.parameters import random_params
-from tests.slow import with_slow
 from tflane_jax.layers.polyline_encoder import PolylineEncoderConfig
 from tflane_jax.losses.bevformer_detr import BevFormerDetrLossConfig
 from tflane_jax.losses.lanesegnet import LaneSegNetLossConfig
@@ -70,7 +69,6 @@ HOSTS = {
         make_line_example,
     ),
 }
-QUICK = ("lines",)
 # Numbers of classes beside floats. The last pair could be real: what only ignores impossible numbers does not pass.
 CLASSES = {np.nan: -7, np.inf: 99, -1e30: 99, 15.0: 1}
 
@@ -127,7 +125,8 @@ def dirty(example, bad):
     return example.replace(**parts)
 
 
-@pytest.mark.parametrize("name", with_slow(HOSTS, QUICK))
+@pytest.mark.slow
+@pytest.mark.parametrize("name", HOSTS)
 def test_garbage_in_padding_changes_neither_loss_nor_gradient(name):
     model, losses, make = HOSTS[name]
     task = LaneGraphTask(model=replace(model, priors=PRIORS), losses=losses)

@@ -29,6 +29,7 @@ def count(tree):
     return sum(leaf.size for leaf in jax.tree.leaves(tree))
 
 
+@pytest.mark.slow
 def test_toponet_is_as_large_as_the_reference():
     config = toponet.paper_config()
     module, example = config.build(), camera_shapes(config.encoder)

@@ -118,7 +118,7 @@ DRAWN = {
 }
 
 
-@pytest.mark.parametrize("name", DRAWN)
+@pytest.mark.parametrize("name", with_slow(DRAWN, quick=["toponet"]))
 def test_published_heads_start_as_in_torch(name):
     """torch.nn.Linear: kernel and bias within 1 / sqrt(inputs); the focal class biases and the boxes' last layer stay.
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from tests.parameters import random_params
+from tests.slow import with_slow
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.models.prior import HostQueries, HostSpec
@@ -94,7 +95,7 @@ def encoder(name, fusions):
 
 
 @pytest.mark.parametrize("fusions", [pytest.param(LANE_FUSIONS, marks=pytest.mark.slow), ALL_FUSIONS])
-@pytest.mark.parametrize("name", VARIANTS)
+@pytest.mark.parametrize("name", with_slow(VARIANTS, quick=["paper", "all of them"]))
 def test_padding_changes_nothing_and_gradients_are_finite(name, fusions):
     apply, params, (features, position, traffic, mask) = encoder(name, fusions)
     clean, holes = apply(params, features, position, traffic, mask), traffic.at[2].set(jnp.nan)
@@ -116,7 +117,7 @@ def test_a_lane_hears_only_what_its_mask_allows(name):
     assert changed.tolist() == [True, name not in LOCAL]
 
 
-@pytest.mark.parametrize("name", VARIANTS)
+@pytest.mark.parametrize("name", with_slow(VARIANTS, quick=["paper", "all of them"]))
 def test_no_traffic_equals_an_absent_prior(name):
     apply, params, (features, position, traffic, _) = encoder(name, LANE_FUSIONS)
     nobody = tracks().replace(valid=jnp.zeros(3, bool), frame_valid=jnp.zeros((3, 3), bool))

@@ -95,6 +95,7 @@ def cells(seed):
     return bev, TrafficRaster(features, touched)
 
 
+@pytest.mark.slow
 def test_both_hooks_read_the_traffic():
     """Without the projection the host is that of the TFM alone, and with it, it is not."""
     task, example = LaneGraphTask(with_flow(BASELINE, BOTH)), make_example(1)

@@ -180,6 +180,7 @@ def test_a_run_resumed_between_evaluations_judges_again(whole, tmp_path):
     assert timeless(folder) == timeless(whole)
 
 
+@pytest.mark.slow
 def test_seeds_have_cycles_of_their_own(whole, tmp_path):
     config = dataclasses.replace(FREQUENT, seeds=(0, 5))
     run_cycles(tmp_path / "a", config=config)

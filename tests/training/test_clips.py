@@ -11,7 +11,6 @@ import pytest
 from tests.models.cases import BASELINE, CAMERA_TOPONET, make_camera_example
 from tests.models.test_marker_fusion import CONFIG, observed, seeing
 from tests.parameters import random_params
-from tests.slow import with_slow
 from tflane_jax.datasets.clips import as_clips
 from tflane_jax.errors import UserError
 from tflane_jax.evaluation.lane_graph import Sightings, evaluate_lanes
@@ -78,7 +77,8 @@ def test_gradients_reach_the_encoder_through_memory(params):
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
 
 
-@pytest.mark.parametrize("batch_size", with_slow([1, 4], quick=[4]))
+@pytest.mark.slow
+@pytest.mark.parametrize("batch_size", [1, 4])
 def test_evaluation_streams_through_scenes(params, batch_size):
     frames = scenes()
     step, memory, expected = jax.jit(ALONE.step), ALONE.start(), []
@@ -167,6 +167,7 @@ def test_only_a_host_with_bev_memory_loops_over_time():
         assert not task.loops
 
 
+@pytest.mark.slow
 def test_frames_are_grouped_by_marker_visibility(params):
     sightings = Sightings()
     frames = [(False, False), (True, True), (False, True), (True, True), (False, True), (False, False), (True, False)]

@@ -25,7 +25,9 @@ def gradients(shapes, step):
     }
 
 
-@pytest.mark.parametrize("shapes", [SHAPES, CONVOLUTIONS, SHAPES | CONVOLUTIONS, {"one": (1, 1)}])
+@pytest.mark.parametrize(
+    "shapes", [pytest.param(SHAPES, marks=pytest.mark.slow), CONVOLUTIONS, SHAPES | CONVOLUTIONS, {"one": (1, 1)}]
+)
 def test_updates_are_optaxs(shapes):
     dimensions = {n: {"kernel": MuonDimensionNumbers(tuple(range(len(s) - 1)), len(s) - 1)} for n, s in shapes.items()}
     theirs = muon(1.0, consistent_rms=0.2, muon_weight_dimension_numbers=dimensions)
@@ -40,7 +42,7 @@ def test_updates_are_optaxs(shapes):
         jax.tree.map(lambda a, b: np.testing.assert_allclose(a, -b, atol=2e-5), found.tree(), expected)
 
 
-@pytest.mark.parametrize("shape", [(6, 40), (40, 6), (3, 3, 8, 8)])
+@pytest.mark.parametrize("shape", [pytest.param((6, 40), marks=pytest.mark.slow), (40, 6), (3, 3, 8, 8)])
 def test_long_kernels_are_optaxs_also_with_tiny_singular_values(shape):
     rows, columns = int(np.prod(shape[:-1])), shape[-1]
     left, _, right = np.linalg.svd(np.random.default_rng(0).normal(size=(rows, columns)), full_matrices=False)

@@ -66,6 +66,7 @@ def test_worlds_of_published_experiments_are_as_they_were(world, history, expect
     assert sums(world, history) == pytest.approx(expected, rel=1e-7)
 
 
+@pytest.mark.slow
 def test_real_like_roads_are_all_but_junctions_with_many_connectors():
     found = networks(REAL_LIKE.roads, 40)
     kinds = [network.kind for network in found]

@@ -11,6 +11,7 @@ from tflane_jax.geometry.rings import signed_area
 from tflane_jax.scene import LineType
 
 
+@pytest.mark.slow
 def test_kerbs_never_cross_a_vehicle_lane():
     for net in case_networks():
         for segment in net.map.segments.values():

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from tests.test_cli import use_fakes
+from tests.tiny_run import use_fakes
 from tflane_jax.cli import main
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 

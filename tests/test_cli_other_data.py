@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from tests.test_cli import CONFIG, use_fakes
+from tests.tiny_run import CONFIG, use_fakes
 from tflane_jax.cli import main
 from tflane_jax.commands import submit
 from tflane_jax.commands.sources import data_name, model_title

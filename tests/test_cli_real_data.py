@@ -7,7 +7,7 @@ from tests.datasets.nuscenes_small import write_nuscenes
 from tests.datasets.small_argoverse2 import write_images as write_ring_images
 from tests.datasets.small_argoverse2 import write_log
 from tests.datasets.test_nuscenes import write_images
-from tests.test_cli import CONFIG, FEW_PICTURES, use_fakes
+from tests.tiny_run import CONFIG, FEW_PICTURES, use_fakes
 from tflane_jax import plots
 from tflane_jax.cli import main
 from tflane_jax.commands import predict_lanes

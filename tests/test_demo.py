@@ -4,7 +4,7 @@ from dataclasses import replace
 from functools import partial
 
 from tests.shared import ROOT
-from tests.test_cli import CONFIG, fakes  # noqa: F401 (a fixture that is used by itself)
+from tests.tiny_run import CONFIG, fakes  # noqa: F401 (a fixture that is used by itself)
 from tflane_jax import demo
 from tflane_jax.ablations.recorded import Measured
 from tflane_jax.ablations.results import Results

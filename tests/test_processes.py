@@ -12,7 +12,7 @@ import pytest
 
 from tests.shared import ROOT
 from tests.slow import with_slow
-from tests.test_cli import CONFIG as TINY
+from tests.tiny_run import CONFIG as TINY
 from tests.training.many_processes import CONFIG, draw, score
 from tests.training.stub_run import run
 from tests.training.test_loop import arrays, timeless

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import pytest
 from flax.errors import ScopeParamShapeError
 
-from tests.test_cli import CONFIG as TINY
-from tests.test_cli import fakes  # noqa: F401 (a fixture that is used by itself)
 from tests.test_migrations import renamed_back
+from tests.tiny_run import CONFIG as TINY
+from tests.tiny_run import fakes  # noqa: F401 (a fixture that is used by itself)
 from tflane_jax.config import RunConfig, load_config
 from tflane_jax.config_io import to_json
 from tflane_jax.errors import UserError

@@ -12,7 +12,7 @@ import time
 import pytest
 
 from tests.shared import ROOT
-from tests.test_cli import CONFIG, fakes  # noqa: F401 (a fixture that is used by itself)
+from tests.tiny_run import CONFIG, fakes  # noqa: F401 (a fixture that is used by itself)
 from tflane_jax.cli import main
 from tflane_jax.startup import in_another_thread, ready, showing, stage
 from tflane_jax.tasks.lane_graph import LaneGraphTask

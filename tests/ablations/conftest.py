@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import pytest
 
-from tests.test_cli import CONFIG
+from tests.tiny_run import CONFIG
 from tflane_jax.evaluation.results import Evaluation
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tests.ablations import test_tables
-from tests.test_cli import CONFIG, fakes  # noqa: F401 (a fixture that is used by itself)
+from tests.tiny_run import CONFIG, fakes  # noqa: F401 (a fixture that is used by itself)
 from tflane_jax.ablations import workers
 from tflane_jax.ablations.archive import read_archive, write_archive
 from tflane_jax.ablations.declaration import Claim

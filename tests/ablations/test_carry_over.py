@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from tests.datasets.test_nuscenes_scenes import content
-from tests.test_cli import CONFIG as TINY
-from tests.test_cli import fakes  # noqa: F401 (a fixture that is used by itself)
+from tests.tiny_run import CONFIG as TINY
+from tests.tiny_run import fakes  # noqa: F401 (a fixture that is used by itself)
 from tflane_jax.ablations import carry_over as subject
 from tflane_jax.ablations import carry_over_plan as plans
 from tflane_jax.ablations.carry_over import CLAIMS, COLUMNS, OTHER, PRIMARY, carry_over

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 
 from tests.ablations.test_identity import QUICK
-from tests.test_cli import fakes  # noqa: F401 (a fixture that is used by itself)
+from tests.tiny_run import fakes  # noqa: F401 (a fixture that is used by itself)
 from tflane_jax.ablations import workers
 from tflane_jax.ablations.declaration import Claim, Declaration, Declared, check, declare
 from tflane_jax.ablations.jobs import plan_jobs

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from tests.ablations.test_identity import QUICK
-from tests.test_cli import fakes  # noqa: F401 (a fixture that is used by itself)
+from tests.tiny_run import fakes  # noqa: F401 (a fixture that is used by itself)
 from tflane_jax.ablations import scores, workers
 from tflane_jax.ablations.jobs import Job, check_rows, plan_jobs
 from tflane_jax.ablations.recorded import Measured

@@ -6,7 +6,7 @@ import shutil
 import pytest
 
 from tests.ablations.test_tables import small
-from tests.test_cli import fakes  # noqa: F401 (a fixture that is used by itself)
+from tests.tiny_run import fakes  # noqa: F401 (a fixture that is used by itself)
 from tflane_jax.ablations.table_plan import plan_table
 from tflane_jax.ablations.table_run import run_table
 from tflane_jax.cli import main

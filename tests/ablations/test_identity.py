@@ -6,7 +6,7 @@ import shutil
 
 import pytest
 
-from tests.test_cli import fakes  # noqa: F401 (a fixture that is used by itself)
+from tests.tiny_run import fakes  # noqa: F401 (a fixture that is used by itself)
 from tflane_jax.ablations import workers
 from tflane_jax.ablations.jobs import Job, file_names
 from tflane_jax.ablations.scores import code_digest, measure, with_test_set

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 
 from tests.ablations.test_tables import small
-from tests.test_cli import fakes  # noqa: F401 (a fixture that is used by itself)
+from tests.tiny_run import fakes  # noqa: F401 (a fixture that is used by itself)
 from tflane_jax.ablations import rate_search, workers
 from tflane_jax.ablations.paper.table import RateSearch
 from tflane_jax.ablations.rate_search import search_rates

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from tests.shared import ROOT
-from tests.test_cli import fakes  # noqa: F401 (a fixture that is used by itself)
+from tests.tiny_run import fakes  # noqa: F401 (a fixture that is used by itself)
 from tflane_jax.ablations import workers
 from tflane_jax.ablations.declaration import Claim, check
 from tflane_jax.ablations.paper.table import PaperTable, Quoted, TableRow, longer, shortened

@@ -12,6 +12,7 @@ import pytest
 from tflane_jax.cli import OneLineWarnings, main
 from tflane_jax.commands.train import score_table
 from tflane_jax.datasets.base import TruncationWarning
+from tflane_jax.errors import not_installed
 
 
 def test_warnings_are_one_line_each_and_told_once(capsys):
@@ -89,6 +90,24 @@ def test_where_results_go_is_checked_before_anything_is_read(command, tmp_path, 
     assert main([*command.split(), "--out", "file/out"]) == 2
     said = capsys.readouterr().err
     assert said == f"tflane: cannot write file/out: {tmp_path}/file is no folder; choose another path\n"
+
+
+def test_a_package_that_is_missing_is_named_with_its_remedy(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("TFLANE_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setitem(sys.modules, "cv2", None)
+    command = "train --config gtn_lane/gtn --data.train 1 --data.val 1 --training.batch-size 1"
+    assert main([*command.split(), "--out", str(tmp_path / "run")]) == 2
+    said = capsys.readouterr().err
+    assert said.endswith(
+        "\ntflane: cv2 is not installed: run `pip install -e '.[images]'` in the checkout of tflane_jax\n"
+    )
+    assert "Traceback" not in said
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_package_of_ones_own_that_is_missing_keeps_its_traceback():
+    assert not_installed(ModuleNotFoundError("No module named 'mine'", name="mine")) is None
+    assert "[plot]" in str(not_installed(ModuleNotFoundError("", name="matplotlib.axes")))
 
 
 def test_the_scores_of_a_training_are_a_table_with_a_row_for_each_group_of_lanes():

@@ -21,7 +21,7 @@ from typing import Any
 
 from tflane_jax.commands.arguments import comparisons, data, markers, models
 from tflane_jax.commands.arguments.shared import CommandParser
-from tflane_jax.errors import Interrupted, UserError
+from tflane_jax.errors import Interrupted, UserError, not_installed
 from tflane_jax.memory import keep_freed_memory
 from tflane_jax.own_modules import add_imports, import_own, look_in, take_imports
 from tflane_jax.startup import leave
@@ -62,6 +62,11 @@ def _run_command(options: argparse.Namespace, rest: Sequence[str]) -> int:
         return code
     except UserError as error:
         print(f"tflane: {error}", file=sys.stderr)
+        return 2
+    except ModuleNotFoundError as error:
+        if (told := not_installed(error)) is None:
+            raise
+        print(f"tflane: {told}", file=sys.stderr)
         return 2
     except KeyboardInterrupt as error:
         print("tflane: stopped", file=sys.stderr)

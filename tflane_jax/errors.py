@@ -1,5 +1,7 @@
 """The errors that the command line shows to its user."""
 
+_EXTRAS = {"cv2": "images", "grain": "images", "matplotlib": "plot", "pyarrow": "data", "shapely": "data"}
+
 
 class LeftOutWarning(UserWarning):
     """Parts of an input that are not used, though a user may think so."""
@@ -20,6 +22,12 @@ def missing_extra(what: str, extra: str) -> UserError:
 def install(extra: str) -> str:
     """Return how to install an extra of this package."""
     return f"run `pip install -e '.[{extra}]'` in the checkout of tflane_jax"
+
+
+def not_installed(error: ModuleNotFoundError) -> UserError | None:
+    """Return what to install if the module is one of an extra of this package."""
+    module = (error.name or "").partition(".")[0]
+    return missing_extra(f"{module} is not installed", _EXTRAS[module]) if module in _EXTRAS else None
 
 
 class Interrupted(KeyboardInterrupt):

@@ -133,6 +133,7 @@ def test_a_split_of_the_world_stands_beside_all_recorded_logs(tmp_path, capsys):
     assert "there is no" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_distributions_of_several_data_are_laid_side_by_side(tmp_path, capsys):
     maps = tmp_path / "maps"
     maps.mkdir()

@@ -44,6 +44,7 @@ def test_prediction_of_segments_adds_boundaries_and_types(tmp_path, monkeypatch)
         predict_lanes.predict(Run("run", RunConfig(), 1, ({},)), options)
 
 
+@pytest.mark.slow
 def test_images_of_the_world_are_rendered_for_the_picture(tmp_path, monkeypatch):
     class World(SimulatedDataset):
         """Scenes whose examples have images if they are asked for."""

@@ -149,6 +149,7 @@ def test_a_module_that_cannot_be_imported_is_one_error(name, message, capsys):
     assert said.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_other_processes_know_the_classes_too(monkeypatch):
     """One of a module beside the configuration, and one of the configuration itself; also read from JSON."""
     Path("inside.py").write_text(LOSS.format(name="InsideLossConfig") + CONFIG.format(name="InsideLossConfig"))

@@ -169,7 +169,7 @@ def test_warnings_of_workers_are_those_of_the_build(tmp_path, monkeypatch, capfd
     assert "more lanes" not in capfd.readouterr().err  # nothing was shown by the workers themselves
 
 
-@pytest.mark.parametrize("workers", [1, 2])
+@pytest.mark.parametrize("workers", with_slow([1, 2], quick=[1]))
 def test_a_failed_build_leaves_nothing(tmp_path, monkeypatch, workers):
     monkeypatch.setattr(parallel, "BLOCK", 1)
     with pytest.raises(RuntimeError, match="example 2 is broken"):
@@ -293,7 +293,8 @@ def test_builders_at_the_same_time_build_once(tmp_path):
     assert sorted((tmp_path / "made").read_text().split()) == ["0", "0", "1", "2", "3", "4", "5"]
 
 
-@pytest.mark.parametrize("kind", [pytest.param(signal.SIGINT, marks=pytest.mark.slow), signal.SIGKILL])
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", [signal.SIGINT, signal.SIGKILL])
 def test_a_killed_build_leaves_no_entry_and_its_remains_are_cleared(tmp_path, kind):
     builder = start(tmp_path, 1.0)
     for _ in range(600):

@@ -165,6 +165,7 @@ def test_an_invalid_camera_may_hold_anything(encode, memory):
 @pytest.mark.parametrize(
     "change", [{"capacity": 20, "remat": True}, {"attention": "kernel", "levels": 1}], ids=["deformable", "kernel"]
 )
+@pytest.mark.slow
 def test_gradients_do_not_depend_on_what_padding_holds(change):
     config = replace(CONFIG, **change)
     model, views = BevFormer(config), ring().replace(valid=np.array([True, False, True]))

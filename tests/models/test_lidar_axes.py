@@ -122,6 +122,7 @@ def test_the_road_users_ahead_come_first_in_either_axes():
     assert blind.observe(in_lidar_axes(example), None)[0].index.tolist() != here.index.tolist()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("vehicle", [True, False])
 def test_the_truth_of_the_bev_mask_lies_where_the_mask_does(vehicle):
     """The mask of lines in the lidar's frame, its cells turned into the ego axes, as the mask head's are."""

@@ -21,7 +21,6 @@ from tests.models.cases import (
 from tests.models.toy_prior import CrossingsConfig, with_crossings
 from tests.parameters import random_params
 from tests.shared import assert_same
-from tests.slow import with_slow
 from tflane_jax.limits import Rules, SettingError, splits
 from tflane_jax.models.bevformer_detr import BevFormerDetrConfig
 from tflane_jax.models.prior import HostQueries, HostSpec
@@ -73,7 +72,8 @@ def test_what_a_new_prior_demands_is_checked_by_every_host(name, width, rule):
         host.build()
 
 
-@pytest.mark.parametrize("name", with_slow(HOSTS, quick=("toponet",)))
+@pytest.mark.slow
+@pytest.mark.parametrize("name", HOSTS)
 def test_a_new_prior_plugs_into_every_host_by_both_hooks(name):
     host, make = HOSTS[name]
     task = LaneGraphTask(replace(host, priors=WithToy(traffic_flow=FLOW, crossings=CrossingsConfig())))

@@ -220,7 +220,8 @@ def test_map_coordinates_are_normalised_by_the_range_of_the_host():
     np.testing.assert_allclose(tokens, scaled, atol=1e-5)
 
 
-@pytest.mark.parametrize("absent", with_slow(["nothing", "reference"], quick=["reference"]))
+@pytest.mark.slow
+@pytest.mark.parametrize("absent", ["nothing", "reference"])
 def test_a_host_of_any_number_of_points_reads_examples_without_a_map(absent):
     """As a map whose lines are all invalid; the parameters depend on the number of points.
 

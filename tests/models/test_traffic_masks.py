@@ -149,6 +149,7 @@ class Fusion(nn.Module):
 
 
 # In one softmax for all, tokens read lanes in the first layer and are read in the second.
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "depth"), [("paper", 1), ("joint", 2)])
 def test_groups_of_queries_hear_nothing_of_each_other(name, depth):
     """MapTRv2's one-to-many group, by way of the road users as well: tokens read lanes, and lanes read tokens."""

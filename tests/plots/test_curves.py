@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tflane_jax.errors import UserError
-from tflane_jax.plots.curves import BANDS, curves, save_comparison_curves, save_curves
+from tflane_jax.plots.curves import bands, curves, save_comparison_curves, save_curves
 
 pytest.importorskip("matplotlib")
 from matplotlib.figure import Figure
@@ -105,7 +105,7 @@ def test_a_model_has_one_colour_in_all_panels(tmp_path, figures):
     assert len(set(colours.values())) == 2
     assert first.lines[0].get_color() == colours["lanes"]
     (legend,) = figures[0].legends
-    assert legend.get_title().get_text() == BANDS
+    assert legend.get_title().get_text() == bands("runs")
     texts = [text.get_text() for text in legend.get_texts()]
     assert sorted(texts) == ["lanes (1 run)", "segments (1 run)"]
     shown = dict(zip([text.partition(" (")[0] for text in texts], legend.get_lines(), strict=True))

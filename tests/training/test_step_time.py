@@ -22,7 +22,7 @@ def waiting(folder):
     return [record["waiting"] for record in read_records(folder / "metrics.jsonl") if record["split"] == "train"]
 
 
-@pytest.mark.parametrize("dataset", [Slow, LineDataset])
+@pytest.mark.parametrize("dataset", [pytest.param(Slow, marks=pytest.mark.slow), LineDataset])
 def test_a_training_that_waits_for_examples_says_so_once(dataset, tmp_path, capsys):
     config = dataclasses.replace(CONFIG, steps=8)
     arrays = Streamed(dataset(), StreamingConfig(threads=1, ahead=2))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from tests.world.road_networks import case_networks, crossings_of, inside_boxes
 from tflane_jax.datasets.map_geometry import MapGeometry

@@ -131,7 +131,11 @@ def test_lights_show_the_state_at_the_start():
         (WorldConfig(duration_s=2.0), "raise duration_s"),
         (WorldConfig(duration_s=2.3), "raise duration_s"),
         (WorldConfig(severity=1.5), "severity"),
-        (replace(SMALL, duration_s=60.0, keyframes=25, rate_hz=2.0), "Raise roads.reach and roads.ego_reach"),
+        pytest.param(
+            replace(SMALL, duration_s=60.0, keyframes=25, rate_hz=2.0),
+            "Raise roads.reach and roads.ego_reach",
+            marks=pytest.mark.slow,
+        ),
     ],
 )
 def test_errors_name_the_remedy(config, message):
@@ -160,6 +164,7 @@ def test_other_rates_and_a_single_key_frame():
     assert speed.max() < 14.5
 
 
+@pytest.mark.slow
 def test_scenes_are_neither_empty_nor_jammed():
     """Road users within +-50 m x +-25 m of the ego vehicle, over thirty scenes of the real road networks."""
     near, speed, moving_vehicles = [], [], []

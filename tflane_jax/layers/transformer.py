@@ -60,6 +60,18 @@ class Residual(nn.Module):
         return x + change if self.config.norm_first else norm(x + change)
 
 
+def add_and_norm(
+    name: str, x: Float[Array, "*b c"], change: Float[Array, "*b c"], *, dropout: float, deterministic: bool
+) -> Float[Array, "*b c"]:
+    """Return the norm of a residual sum, from within a compact method of the layer that owns its parameters.
+
+    The dropout is called `<name>_dropout` and the norm `<name>_norm`, as published detectors have them: side by side
+    with their attentions, where `Residual` has a module around each. A change in bfloat16 is added to a float32 x.
+    """
+    change = nn.Dropout(dropout, name=f"{name}_dropout")(change, deterministic=deterministic)
+    return nn.LayerNorm(epsilon=1e-5, name=f"{name}_norm")(x + change)
+
+
 class FeedForward(nn.Module):
     """Linear layer, activation, linear layer.
 

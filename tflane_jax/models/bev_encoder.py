@@ -30,6 +30,7 @@ from tflane_jax.geometry import BevGrid
 from tflane_jax.geometry.pillars import cell_points
 from tflane_jax.layers.bev_attention import SpatialCrossAttention, TemporalSelfAttention
 from tflane_jax.layers.geometry_kernel import GeometryKernelAttention
+from tflane_jax.layers.transformer import add_and_norm
 from tflane_jax.limits import Count, FractionBelowOne, Rules, splits
 from tflane_jax.models.prior import BevHook
 
@@ -224,9 +225,7 @@ class BevEncoderLayer(nn.Module):
         config, grid = self.config, self.config.grid
         init = nn.initializers.xavier_uniform()
 
-        def add(x, change, name):
-            change = nn.Dropout(config.dropout, name=f"{name}_dropout")(change, deterministic=deterministic)
-            return nn.LayerNorm(epsilon=1e-5, name=f"{name}_norm")(x + change.astype(jnp.float32))
+        add = partial(add_and_norm, dropout=config.dropout, deterministic=deterministic)
 
         temporal = TemporalSelfAttention(
             config.dim,
@@ -236,7 +235,7 @@ class BevEncoderLayer(nn.Module):
             config.dtype,
             name="temporal_attention",
         )
-        queries = add(queries, temporal(queries + position, *frames, (grid.rows, grid.columns), cells), "temporal")
+        queries = add("temporal", queries, temporal(queries + position, *frames, (grid.rows, grid.columns), cells))
         if config.attention == "kernel":
             spatial = GeometryKernelAttention(
                 config.dim, config.anchors, config.kernel, config.capacity, config.dtype, name="spatial_attention"
@@ -245,7 +244,7 @@ class BevEncoderLayer(nn.Module):
             spatial = SpatialCrossAttention(
                 config.dim, config.heads, config.spatial_points, config.capacity, config.dtype, name="spatial_attention"
             )
-        queries = add(queries, spatial(queries, tokens, shapes, reference, visible), "spatial")
+        queries = add("spatial", queries, spatial(queries, tokens, shapes, reference, visible))
         # The barriers keep XLA from fusing across the hook: a prior without data gives bit-identical features.
         queries = lax.optimization_barrier(queries)
         if fuse is not None:
@@ -253,4 +252,4 @@ class BevEncoderLayer(nn.Module):
         x = nn.relu(nn.Dense(config.hidden, kernel_init=init, dtype=config.dtype, name="expand")(queries))
         x = nn.Dropout(config.dropout, name="hidden_dropout")(x, deterministic=deterministic)
         x = nn.Dense(config.dim, kernel_init=init, dtype=config.dtype, name="contract")(x)
-        return add(queries, x, "feed_forward")
+        return add("feed_forward", queries, x)

@@ -30,7 +30,7 @@ from tflane_jax.layers.graph import ElementNodes, Mlp, RelationshipHead, SceneGr
 from tflane_jax.layers.positions import inverse_sigmoid, sine_encoding
 from tflane_jax.layers.precision import run_layer
 from tflane_jax.layers.sampling import sample_bilinear
-from tflane_jax.layers.transformer import FeedForward, TransformerConfig
+from tflane_jax.layers.transformer import FeedForward, TransformerConfig, add_and_norm
 from tflane_jax.models.element_decoder import ElementOutput
 from tflane_jax.models.lane_queries import LaneDecoderConfig
 from tflane_jax.scene import CenterlinePrediction, ElementPrediction, Prediction
@@ -90,9 +90,7 @@ class LaneDecoderLayer(nn.Module):
         """
         config = self.config
 
-        def add(name, x, change):
-            change = nn.Dropout(config.dropout, name=f"{name}_dropout")(change, deterministic=deterministic)
-            return nn.LayerNorm(epsilon=1e-5, name=f"{name}_norm")(x + change)
+        add = partial(add_and_norm, dropout=config.dropout, deterministic=deterministic)
 
         attend = MultiHeadAttention(config.dim, config.heads, config.dropout, name="self_attention")
         placed = queries + position

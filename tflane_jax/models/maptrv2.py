@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float
 from tflane_jax.layers.attention import MultiHeadAttention
 from tflane_jax.layers.deformable import DeformableAttention
 from tflane_jax.layers.precision import run_layer
-from tflane_jax.layers.transformer import FeedForward, TransformerConfig
+from tflane_jax.layers.transformer import FeedForward, TransformerConfig, add_and_norm
 from tflane_jax.limits import CountOrZero, Rules, check_settings
 from tflane_jax.models.auxiliary import AUXILIARY, AuxiliaryName, LineMaskHead
 from tflane_jax.models.camera_encoder import CameraEncoderConfig
@@ -159,9 +159,7 @@ class DecoupledLayer(nn.Module):
         """
         config, (h, w, e) = self.config, bev.shape
 
-        def add(name, x, change):
-            change = nn.Dropout(config.dropout, name=f"{name}_dropout")(change, deterministic=deterministic)
-            return nn.LayerNorm(epsilon=1e-5, name=f"{name}_norm")(x + change)
+        add = partial(add_and_norm, dropout=config.dropout, deterministic=deterministic)
 
         def among(axis, mask, name):
             """Attention among the queries along an axis, for each index of the other one."""

@@ -24,8 +24,6 @@ _NOT_DRAWN = ("step", "split", "seconds", "waiting")
 # Beginnings of the names of errors among the scores: LaneSegNet's AE_dist (metres) and AE_type, TuSimple's FP and FN.
 _ERRORS = ("AE_", "FP", "FN")
 
-BANDS = "line: mean over runs; band: from the least to the greatest"
-
 Series = tuple[Int[np.ndarray, " n"], Float[np.ndarray, "n seeds"]]
 
 
@@ -54,7 +52,7 @@ def save_curves(path: Path, records: Iterable[Mapping[str, Any]]) -> Path:
     footer = 0.2 if seeds > 1 else 0.0
     figure, axes = new_figure(-(-len(groups) // columns), columns, panel=(4.6, 3.2), footer=footer)
     if seeds > 1:
-        figure.supxlabel(BANDS.replace("runs", f"{seeds} seeds"), fontsize=8)
+        figure.supxlabel(bands(f"{seeds} seeds"), fontsize=8)
     # A score has one colour in all panels.
     scores = _styles(dict.fromkeys(name.partition("/")[2] for split, name in series if split == "val"))
     for ax, ((split, group, kind), names) in zip(axes.flat, groups.items(), strict=False):
@@ -108,7 +106,7 @@ def save_comparison_curves(
     figure.legend(
         lines.values(),
         [f"{model} ({counted(number[model], 'run')})" for model in lines],
-        title=BANDS,
+        title=bands("runs"),
         loc="outside lower center",
         ncols=min(len(lines), 2),
         fontsize=8,
@@ -116,6 +114,11 @@ def save_comparison_curves(
         frameon=False,
     )
     return save_figure(figure, path)
+
+
+def bands(of: str) -> str:
+    """Return what a curve and the band around it are, of several runs or seeds."""
+    return f"line: mean over {of}; band: from the least to the greatest"
 
 
 def _place(key: tuple[str, str]) -> int:

@@ -142,6 +142,10 @@ def test_the_page_leaves_out_best_checkpoints_that_repeat_the_last(tmp_path):
     assert "\ntflane tables x --seeds 1 --jobs 2 --cores 1\n" in written
     (tmp_path / "x.json").write_text(json.dumps(json.loads((tmp_path / "x.json").read_text()) | {"declared seeds": 9}))
     assert "**Interim**: 1 of 9 declared seeds." in page(tmp_path)
+    (tmp_path / "x.json").write_text(json.dumps(json.loads((tmp_path / "x.json").read_text()) | {"seeds": [0, 2]}))
+    written = page(tmp_path)
+    assert "1 to 2 seeds (0, 2), 1 updates a run" in written
+    assert "\ntflane tables x --seeds 3 --jobs 2 --cores 1\n" in written
     two = {"table": "tf_lane.5", "cores of a run": [1, 2], "seeds": [0, 1]}
     (tmp_path / "tf_lane.5.json").write_text(json.dumps(summary | two | {"findings": [], "quoted": {"rows": []}}))
     written = page(tmp_path)

@@ -98,7 +98,7 @@ def _section(summary: Mapping[str, Any]) -> list[str]:
         "",
         "```",
         # Numbers depend on the cores of a run, which --jobs alone takes from the machine.
-        f"tflane tables {summary['table']} --seeds {len(summary['seeds'])} --jobs 2{_cores_option(summary)}",
+        f"tflane tables {summary['table']} --seeds {1 + max(summary['seeds'])} --jobs 2{_cores_option(summary)}",
         "```",
         "",
         *_wrapped(facts),
@@ -123,10 +123,12 @@ def _section(summary: Mapping[str, Any]) -> list[str]:
 
 
 def _seeds(summary: Mapping[str, Any]) -> str:
-    """Return how many seeds a table has, and the least that a row has where it has fewer."""
-    most = len(summary["seeds"])
+    """Return how many seeds a table has, and the least that a row has where it has fewer; which, if not the first."""
+    seeds = summary["seeds"]
+    most = len(seeds)
     least = min((row.get("seeds", most) for row in summary["rows"]), default=most)
-    return counted(most, "seed") if least == most else f"{least} to {most} seeds"
+    number = counted(most, "seed") if least == most else f"{least} to {most} seeds"
+    return number if list(seeds) == list(range(most)) else f"{number} ({_listed(seeds)})"
 
 
 def _interim(summary: Mapping[str, Any]) -> str:

@@ -63,6 +63,7 @@ def logs(tmp_path):
     return tmp_path
 
 
+@pytest.mark.slow
 def test_a_new_dataset_is_one_file_and_one_entry(tmp_path):
     text = Path(sources.__file__).read_text(encoding="utf-8")
     entry = "    tusimple.SOURCE,\n"

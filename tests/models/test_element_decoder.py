@@ -92,6 +92,7 @@ def check(case):
         np.testing.assert_array_equal(by_query, case.outputs[f"pos_assigned_gt_inds.{layer}.{image}"])
 
 
+@pytest.mark.slow
 def test_features_of_padding_change_nothing():
     config = ElementDecoderConfig(dim=16, heads=2, levels=2, encoder_layers=1, layers=2, queries=3, hidden=16)
     rng = np.random.default_rng(0)

@@ -115,6 +115,7 @@ def test_training_reaches_the_parameters_of_a_new_prior():
     assert "areas" in task.parts  # what a prior reads is loaded
 
 
+@pytest.mark.slow
 def test_memories_go_from_frame_to_frame_of_a_clip_and_of_a_stream():
     spec = BASELINE.spec
     priors = WithToy(traffic_flow=FLOW, crossings=CrossingsConfig()).build(spec)

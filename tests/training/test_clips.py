@@ -53,6 +53,7 @@ def test_clips_keep_the_order_and_stay_within_scenes():
     as_clips(scenes(length=4), 2)
 
 
+@pytest.mark.slow
 def test_the_loss_of_clips_equals_that_of_their_frames_with_memory(params):
     key = jax.random.key(0)
     unseen = jax.tree.map(jnp.asarray, scenes(sight=(False,)))

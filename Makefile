@@ -9,7 +9,7 @@ STAMP := $(VENV)/.installed
 help:
 	@echo "make demo         set up, train with and without traffic flow on the built-in world, table and picture"
 	@echo "make test         set up, lint, run the tests (what CI runs)"
-	@echo "make test-slow    types, and the tests that take longer"
+	@echo "make test-slow    check types, run the longer tests"
 	@echo "make lint         ruff (rules and format) and pyright"
 	@echo "make same-losses  train every configuration in this checkout and in BEFORE=../before, compare bit by bit"
 	@echo "make bench        the benchmarks, as JSON under runs/bench"
@@ -39,7 +39,7 @@ test: $(STAMP)
 	$(BIN)/ruff format --check .
 	$(PYTEST)
 
-# Before a release. Types take a minute on two cores, which `make test` spends on tests.
+# Before a release. With types, `make test` would take a minute longer.
 test-slow: types
 	$(PYTEST) -m slow
 

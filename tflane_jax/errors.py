@@ -1,5 +1,6 @@
 """The errors that the command line shows to its user."""
 
+# Modules that only extras of this package install, and the extra of each.
 _EXTRAS = {"cv2": "images", "grain": "images", "matplotlib": "plot", "pyarrow": "data", "shapely": "data"}
 
 
@@ -25,7 +26,7 @@ def install(extra: str) -> str:
 
 
 def not_installed(error: ModuleNotFoundError) -> UserError | None:
-    """Return what to install if the module is one of an extra of this package."""
+    """Return what to tell the user of a module that an extra of this package installs; None for any other module."""
     module = (error.name or "").partition(".")[0]
     return missing_extra(f"{module} is not installed", _EXTRAS[module]) if module in _EXTRAS else None
 

@@ -132,7 +132,8 @@ def test_the_page_leaves_out_best_checkpoints_that_repeat_the_last(tmp_path):
         "rows": rows,
     }
     summary |= {"cores of a run": [1], "commits": [], "devices": [], "core minutes of a run": {"a": 1.0}}
-    (tmp_path / "x.json").write_text(json.dumps(summary | {"findings": [], "quoted": {"rows": []}}))
+    summary |= {"findings": [], "quoted": {"rows": []}}
+    (tmp_path / "x.json").write_text(json.dumps(summary))
     written = page(tmp_path)
     lines = [line.split() for line in written.splitlines() if line.startswith(("| a", "| b"))]
     assert [(line[1], line[3]) for line in lines] == [("a", "last"), ("b", "last"), ("b", "best")]
@@ -140,14 +141,14 @@ def test_the_page_leaves_out_best_checkpoints_that_repeat_the_last(tmp_path):
     assert "1 seed, 1 updates a run" in written
     assert "Interim" not in written  # of a table of another version, whose seeds are not known
     assert "\ntflane tables x --seeds 1 --jobs 2 --cores 1\n" in written
-    (tmp_path / "x.json").write_text(json.dumps(json.loads((tmp_path / "x.json").read_text()) | {"declared seeds": 9}))
+    (tmp_path / "x.json").write_text(json.dumps(summary | {"declared seeds": 9}))
     assert "**Interim**: 1 of 9 declared seeds." in page(tmp_path)
-    (tmp_path / "x.json").write_text(json.dumps(json.loads((tmp_path / "x.json").read_text()) | {"seeds": [0, 2]}))
+    (tmp_path / "x.json").write_text(json.dumps(summary | {"seeds": [0, 2]}))
     written = page(tmp_path)
     assert "1 to 2 seeds (0, 2), 1 updates a run" in written
     assert "\ntflane tables x --seeds 3 --jobs 2 --cores 1\n" in written
     two = {"table": "tf_lane.5", "cores of a run": [1, 2], "seeds": [0, 1]}
-    (tmp_path / "tf_lane.5.json").write_text(json.dumps(summary | two | {"findings": [], "quoted": {"rows": []}}))
+    (tmp_path / "tf_lane.5.json").write_text(json.dumps(summary | two))
     written = page(tmp_path)
     assert "**Interim**: 2 of 5 declared seeds." in written
     assert "\ntflane tables tf_lane.5 --seeds 2 --jobs 2\n" in written

@@ -123,7 +123,7 @@ def _section(summary: Mapping[str, Any]) -> list[str]:
 
 
 def _seeds(summary: Mapping[str, Any]) -> str:
-    """Return how many seeds a table has, and the least that a row has where it has fewer; which, if not the first."""
+    """Return how many seeds a table has, as a range where rows differ, and which they are if not 0, 1, 2, ..."""
     seeds = summary["seeds"]
     most = len(seeds)
     least = min((row.get("seeds", most) for row in summary["rows"]), default=most)

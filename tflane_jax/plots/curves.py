@@ -117,7 +117,7 @@ def save_comparison_curves(
 
 
 def bands(of: str) -> str:
-    """Return what a curve and the band around it are, of several runs or seeds."""
+    """Return the words that explain a curve and its band; `of` says what they were drawn from, such as "8 seeds"."""
     return f"line: mean over {of}; band: from the least to the greatest"
 
 

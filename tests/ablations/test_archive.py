@@ -129,7 +129,7 @@ def test_a_table_from_its_record_is_that_of_its_runs(tiny, made, tmp_path, monke
     (content, commits), (expected, own) = summary(tmp_path), summary(made)
     assert content == expected
     assert len(commits) == len(own) + 1
-    assert commits[-1].startswith("recorded by code of digest ")
+    assert commits[-1].startswith("measured by code of digest ")
     # What was taken from a record is recorded as it was, and recording it again changes nothing.
     scores = results / "scores" / "paper.9.json.gz"
     assert (tmp_path / "paper.9" / "scores.json.gz").read_bytes() == scores.read_bytes()

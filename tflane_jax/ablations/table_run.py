@@ -257,9 +257,9 @@ def _save_summary(
 
 
 def _measured_elsewhere(job: Job) -> set[str]:
-    """Return by which other states of the code a run was measured, in words; by which ones a recorded run was."""
+    """Return by which states of the code a run was measured, in words: by other ones, of a recorded run by any."""
     found = [measure(job, config, which) for config, which in evaluations(job)]
     codes = {measured.code[:9] for measured in found if measured is not None}
-    if job.recorded is not None:
-        return {f"recorded by code of digest {code}" for code in codes}
-    return {f"measured by code of digest {code}" for code in codes - {code_digest()[:9]}}
+    if job.recorded is None:
+        codes.discard(code_digest()[:9])
+    return {f"measured by code of digest {code}" for code in codes}

@@ -14,6 +14,7 @@ from tflane_jax.config_io import to_json
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import write_json
 from tflane_jax.training import provenance
+from tflane_jax.training.checkpoint import Checkpoints
 from tflane_jax.training.loop import TrainingConfig
 from tflane_jax.training.run_folder import check_unchanged
 
@@ -76,8 +77,12 @@ def test_a_store_that_was_moved_holds_the_same_runs(tmp_path):
         check_unchanged(here.folder, to_json(moved.config))
 
 
-@pytest.mark.parametrize(("recorded", "expected"), [({}, (240.0, 2)), ({0: (10, 30.0)}, (60.0 + 90.0, 0))])
-def test_remaining_time_is_measured_where_it_can_be(tmp_path, monkeypatch, recorded, expected):
+@pytest.mark.parametrize(
+    ("recorded", "checkpoint", "expected"),
+    [({}, None, (240.0, 2)), ({0: (12, 36.0)}, 10, (60.0 + 90.0, 0)), ({0: (12, 36.0)}, None, (90.0 + 90.0, 0))],
+)
+def test_remaining_time_is_measured_where_it_can_be(tmp_path, monkeypatch, recorded, checkpoint, expected):
+    """A run goes on at its last checkpoint: what it recorded after that is trained again."""
     monkeypatch.setattr(Job, "is_complete", lambda self: False)
     monkeypatch.setattr(Job, "exists", lambda self: True)
     plan = stored_jobs({"row": changed(steps=30)}, [0, 1], tmp_path, threads=THREADS)
@@ -85,6 +90,8 @@ def test_remaining_time_is_measured_where_it_can_be(tmp_path, monkeypatch, recor
         folder = plan["row"][i].folder
         folder.mkdir()
         (folder / "metrics.jsonl").write_text(json.dumps({"step": step, "split": "train", "seconds": seconds}) + "\n")
+        if checkpoint is not None:
+            Checkpoints(folder / "checkpoints").path(checkpoint).mkdir(parents=True)
     assert remaining_seconds(plan, {"row": 2.0}) == expected
 
 

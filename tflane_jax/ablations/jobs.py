@@ -145,6 +145,14 @@ class Job:
             return min(int(json.loads(lines[-1])["step"]), self.config.training.steps)
         return 0
 
+    def resumes_at(self) -> int:
+        """Return the step at which training goes on: that of the last checkpoint; records may be ahead of it."""
+        if self.is_complete():
+            return self.config.training.steps
+        if not self.exists() or self.start() == "overwrite":
+            return 0
+        return min([0, *Checkpoints(self.folder / "checkpoints").steps()][-1], self.config.training.steps)
+
 
 @dataclass(frozen=True)
 class Failure:

@@ -151,7 +151,7 @@ def remaining_seconds(plan: Mapping[str, Sequence[Job]], minutes: Mapping[str, f
             if job.folder in seen or job.is_complete():
                 continue
             seen.add(job.folder)
-            left = job.config.training.steps - job.step()
+            left = job.config.training.steps - job.resumes_at()
             if rates:
                 seconds += left * sum(rates) / len(rates)
             else:

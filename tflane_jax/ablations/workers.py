@@ -115,7 +115,7 @@ def _train_in_workers(queue: Queue, jobs: Sequence[Job], parallel: int, cores: i
         shares = stack.enter_context(cores_of_workers(min(parallel, len(queue)), cores_each(parallel, cores)))
         workers = [stack.enter_context(Worker(share, slot, len(shares))) for slot, share in enumerate(shares)]
         stack.callback(lambda: [worker.end() for worker in workers])  # before any of them is waited for
-        total, done = sum(job.config.training.steps for job in jobs), sum(job.step() for job in jobs)
+        total, done = sum(job.config.training.steps for job in jobs), sum(job.resumes_at() for job in jobs)
         bar = stack.enter_context(
             progress_bar(total=total, initial=done, desc=f"train and measure {len(jobs)} runs", unit="step")
         )

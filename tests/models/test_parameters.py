@@ -24,7 +24,7 @@ from tests.models.cases import (
 from tests.slow import with_slow
 from tflane_jax.models import host
 from tflane_jax.models.area_decoder import AreaDecoderConfig
-from tflane_jax.models.parameters import with_torch_heads, with_xavier_layers
+from tflane_jax.models.parameters import with_torch_biases, with_torch_heads, with_xavier_layers
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 
 BUCKET = dataclasses.replace(
@@ -84,13 +84,53 @@ def test_the_scene_graph_starts_within_torchs_bounds(path, shape, bound):
 
 
 @functools.cache
-def started(name: str) -> dict[str, np.ndarray]:
-    """Return the published start of a host's own heads, drawn over parameters that are 1 everywhere."""
+def started(name: str, draw=with_torch_heads) -> dict[str, np.ndarray]:
+    """Return the published start of a part of a host, by default its heads, over parameters that are 1 everywhere."""
     config, make = HOSTS[name]
     shapes = jax.eval_shape(LaneGraphTask(config).init, jax.random.key(0), make())
     ones = jax.tree.map(lambda leaf: np.ones(leaf.shape, np.float32), dict(shapes))
-    drawn = with_torch_heads({"params": ones}, jax.random.key(1))["params"]
+    drawn = draw({"params": ones}, jax.random.key(1))["params"]
     return {path: np.asarray(leaf) for path, leaf in flatten_dict(drawn, sep="/").items()}
+
+
+FEED_FORWARD = {
+    "toponet": [
+        *(f"layer_{i}/scene_graph/{name}" for i in range(2) for name in ("expand", "contract", "downsample")),
+        *(f"elements/decoder_{i}/feed_forward/{name}" for i in range(2) for name in ("expand", "contract")),
+        *(f"elements/encoder_0/feed_forward/{name}" for name in ("expand", "contract")),
+        *(f"encoder/bev/encoder/layer_0/{name}" for name in ("expand", "contract")),
+        *(f"encoder/bev/motion/{name}" for name in ("hidden", "out")),
+    ],
+    "maptr": [f"layer_{i}/feed_forward/{name}" for i in range(2) for name in ("expand", "contract")],
+}
+
+
+@pytest.mark.parametrize("name", with_slow(FEED_FORWARD, quick=["toponet"]))
+def test_published_feed_forward_biases_start_as_in_torch(name):
+    """torch.nn.Linear: within 1 / sqrt(inputs). Biases of attention are set to 0 by the published code, and stay."""
+    params = started(name, with_torch_biases)
+    assert {path for path, leaf in params.items() if np.any(leaf != 1.0)} == {f"{x}/bias" for x in FEED_FORWARD[name]}
+    for module in FEED_FORWARD[name]:
+        bound = len(params[f"{module}/kernel"]) ** -0.5
+        assert 0.5 * bound < np.abs(params[f"{module}/bias"]).max() <= bound, module
+
+
+def test_biases_of_the_depth_network_start_as_in_torch():
+    part = "encoder/lift/depth_net"
+    given = {
+        f"{part}/reduce/kernel": np.zeros((3, 3, 20, 400), np.float32),
+        f"{part}/reduce/bias": np.zeros(400, np.float32),
+        f"{part}/reduce_norm/scale": np.zeros(400, np.float32),
+        f"{part}/reduce_norm/bias": np.zeros(400, np.float32),
+        f"{part}/depth_mlp/linear_0/kernel": np.zeros((22, 400), np.float32),
+        f"{part}/depth_mlp/linear_0/bias": np.zeros(400, np.float32),
+    }
+    drawn = with_torch_biases({"params": unflatten_dict(given, sep="/")}, jax.random.key(0))
+    largest = {name: np.abs(leaf).max() for name, leaf in flatten_dict(drawn["params"], sep="/").items()}
+    bounds = {f"{part}/reduce/bias": 180**-0.5, f"{part}/depth_mlp/linear_0/bias": 22**-0.5}
+    assert {name for name, found in largest.items() if found} == set(bounds)
+    for name, bound in bounds.items():
+        assert 0.97 * bound < largest[name] <= bound
 
 
 RELATION = [

@@ -20,7 +20,7 @@ from tflane_jax.models.bev_encoder import BevMemory
 from tflane_jax.models.element_decoder import ElementDecoder, ElementDecoderConfig, ElementOutput
 from tflane_jax.models.encoders import EncoderConfig, encode_example, start_bev_memory
 from tflane_jax.models.evidence_encoder import EvidenceEncoderConfig
-from tflane_jax.models.parameters import with_torch_heads, with_xavier_layers
+from tflane_jax.models.parameters import with_torch_biases, with_torch_heads, with_xavier_layers
 from tflane_jax.models.prior import HostSpec, Prior
 from tflane_jax.models.priors import ByPrior, PriorsConfig, bev_hook, encode, observe, start_memories
 from tflane_jax.scene import Example, Prediction
@@ -49,8 +49,8 @@ class HostConfig:
         priors: traffic flow, SD map, markers; none of them gives the vision-only baseline.
         elements: decoder of traffic elements, which needs cameras; None: no traffic elements.
         initial: the start of training. "lecun": kernels are normal, biases 0. "xavier", as in the published code:
-            kernels of the decoders' transformer layers are Xavier-uniform, heads have PyTorch's default and are equal
-            in all layers. Only `init` of the host itself applies it, see `Host.init`.
+            kernels of the decoders' transformer layers are Xavier-uniform, feed-forward biases and heads have PyTorch's
+            default, and heads are equal in all layers. Only `init` of the host itself applies it, see `Host.init`.
     """
 
     encoder: EncoderConfig = EvidenceEncoderConfig()
@@ -147,14 +147,14 @@ class Host(nn.Module):
     def init(self, rngs: Any, *args: Any, **kwargs: Any) -> Any:
         """Return initial variables, as Linen does, with the values that `HostConfig.initial` names.
 
-        Only `init` of the host itself does this. In another module, apply `with_xavier_layers` and `with_torch_heads`
-        (and `with_equal_heads`) to the host's part of the variables.
+        Only `init` of the host itself does this. In another module, apply `with_xavier_layers`, `with_torch_biases` and
+        `with_torch_heads` (and `with_equal_heads`) to the host's part of the variables.
         """
         variables = super().init(rngs, *args, **kwargs)
         if self.config.initial == "lecun":
             return variables
         key = rngs["params"] if isinstance(rngs, dict) else rngs
-        return with_torch_heads(with_xavier_layers(variables, key), key)
+        return with_torch_heads(with_torch_biases(with_xavier_layers(variables, key), key), key)
 
     def setup(self):
         config: HostConfig = self.config

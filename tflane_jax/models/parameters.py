@@ -91,6 +91,36 @@ def with_xavier_layers(variables: Any, key: PRNGKeyArray) -> Any:
     return {**variables, "params": jax.tree_util.tree_map_with_path(drawn, variables["params"])}
 
 
+# Biases of linear layers and convolutions that no module of the published code sets to zero: those of attention are not
+# among them. In the depth network these are all that stand beside a kernel.
+_BIASES = re.compile(
+    r"""(
+        ((areas|elements)/)?(layer|encoder|decoder)_\d+/(feed_forward|scene_graph)/(expand|contract|downsample)
+        | encoder/(.+/)?layer_\d+/(expand|contract)
+        | encoder/(.+/)?motion/(hidden|out)
+        | encoder/(.+/)?depth_net/.+
+    )/bias""",
+    re.VERBOSE,
+)
+
+
+def with_torch_biases(variables: Any, key: PRNGKeyArray) -> Any:
+    """Return initial variables in which biases that the published code leaves alone start as in PyTorch.
+
+    They are uniform within 1 / sqrt(inputs): those of the feed-forward networks in encoder and decoders, of the layers
+    that read the vehicle's motion, and of the depth network. (The published encoder asks for zeros in the second,
+    but of a `Sequential`, which has no bias of its own.)
+    """
+    params: dict[str, Any] = flatten_dict(variables["params"], sep="/")
+    for name, leaf in params.items():
+        kernel = params.get(f"{name.rpartition('/')[0]}/kernel")
+        if kernel is None or not _BIASES.fullmatch(name):
+            continue
+        of_leaf = jax.random.fold_in(key, zlib.crc32(name.encode()))
+        params[name] = uniform_by_fan_in(math.prod(kernel.shape[:-1]))(of_leaf, leaf.shape, leaf.dtype)
+    return {**variables, "params": unflatten_dict(params, sep="/")}
+
+
 # Heads of TopoNet and BEVFormer-DETR, relationship heads of all hosts, and the heads of traffic elements, without what
 # starts at a constant: the focal class biases and the last layer of a box. Other heads draw PyTorch's values themselves
 # (`lane_segments.Branch`).

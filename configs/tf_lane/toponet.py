@@ -32,7 +32,10 @@ def get_config() -> RunConfig:
 
 
 def ablations() -> dict[str, RunConfig]:
-    """Return the baseline on the preset `street`, the same with one part changed, and TopoNet's published forms."""
+    """Return the baseline on the preset `street`, the same with one part changed, and TopoNet's published forms.
+
+    `street_plain` has the published forms but for the refinement, the class target and the weight of the topology.
+    """
     data = WorldData.street()
     model = _host(data)
     street = _small(model, data, steps=7000)
@@ -42,7 +45,10 @@ def ablations() -> dict[str, RunConfig]:
         return replace(street, task=replace(street.task, model=replace(model, **changes)))
 
     without_context = replace(encoder, levels=(), dilations=(1, 2, 4, 1), coordinates=False)
-    published = replace(decoder, output="sigmoid", layers=3)
+    plain = replace(decoder, output="sigmoid", layers=3)
+    adam = replace(optim, lr=1.5e-3, optimizer="adam")
+    street_plain = replace(changed(decoder=plain, encoder=without_context, denoising=None), optim=adam)
+    published = replace(model, encoder=without_context, decoder=replace(plain, refine="fixed"), denoising=None)
     return {
         "street": street,
         "street_sigmoid": changed(decoder=replace(decoder, output="sigmoid")),
@@ -51,10 +57,10 @@ def ablations() -> dict[str, RunConfig]:
         "street_without_denoising": changed(denoising=None),
         "street_class_one": replace(street, task=replace(street.task, losses=replace(losses, class_target="one"))),
         "street_muon_dense": replace(street, optim=replace(optim, muon_kernels="dense")),
-        "street_adam": replace(street, optim=replace(optim, lr=1.5e-3, optimizer="adam")),
+        "street_adam": replace(street, optim=adam),
+        "street_plain": street_plain,
         "street_published": replace(
-            changed(decoder=published, encoder=without_context, denoising=None),
-            optim=replace(optim, lr=1.5e-3, optimizer="adam"),
+            street, task=replace(street.task, model=published, losses=TopoNetLossConfig()), optim=adam
         ),
     }
 

@@ -101,6 +101,15 @@ def test_training_gives_the_numbers_of_one_process(trained, tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("starts", [("shared", "unpictured"), ("unpictured", "shared")])
+def test_processes_need_not_all_be_able_to_draw(tmp_path, starts):
+    """Regression: a host without matplotlib did not gather the state that the others gathered for a picture."""
+    folder = tmp_path / "run"
+    assert [each["step"] for each in together(folder, starts)] == [30, 30]
+    assert (folder / "picture.txt").exists() == (starts[0] == "shared")
+
+
+@pytest.mark.slow
 def test_a_folder_in_use_is_refused_by_all(trained):
     folder, before = trained[0], arrays(trained[0])
     said = together(folder, ["new", "new"])

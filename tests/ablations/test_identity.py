@@ -3,6 +3,7 @@
 import json
 import os
 import shutil
+from dataclasses import replace
 
 import pytest
 
@@ -177,6 +178,8 @@ def test_only_settings_of_the_data_make_a_test_set(tiny):
     job = job_of(tiny, None)
     with pytest.raises(UserError, match=r"--optim\.lr is none"):
         with_test_set(job.config, ["--optim.lr", "1"])
+    training, optim = replace(job.config.training, steps=100_000), replace(job.config.optim, warmup_steps=12_000)
+    assert with_test_set(replace(job.config, training=training, optim=optim), ["--data.test", "3"]).data.test == 3
 
 
 def test_scores_are_those_of_the_code_that_runs_though_its_files_change(tmp_path, monkeypatch):

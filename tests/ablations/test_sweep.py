@@ -67,3 +67,18 @@ def test_settings_that_cannot_be_swept_are_refused(folder, tmp_path, monkeypatch
         runs_below(tmp_path)
     with pytest.raises(UserError, match=r"unknown setting --data\.world\.severty"):
         sweep({"other": folder / "other"}, "data.world.severty", ["1"], tmp_path)
+
+
+def test_models_with_different_test_data_are_refused(folder, tmp_path, monkeypatch):
+    monkeypatch.setenv("TFLANE_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(LaneGraphTask, "evaluate", None)
+    config = dataclasses.replace(CONFIG, data=dataclasses.replace(CONFIG.data, test=CONFIG.data.test + 1))
+    example = jax.tree.map(jax.numpy.zeros_like, config.task.shapes(config.data))
+    save_weights(config, random_params(config.task.init, example, spread=0.2), tmp_path / "more")
+    models = {"other": folder / "other", "more": tmp_path / "more"}
+    with pytest.raises(
+        UserError, match=r"runs of other and more have different test data \(data\.world\.severity = 0\)"
+    ):
+        sweep(models, "data.world.severity", ["0"], tmp_path / "out")
+    with pytest.raises(TypeError, match="not callable"):  # the same test data: it goes on to evaluate
+        sweep(models, "data.world.severity", ["0"], tmp_path / "out", ["--data.test", "2"])

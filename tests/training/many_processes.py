@@ -1,8 +1,9 @@
 """One of several processes that train the stub task: `python -m tests.training.many_processes FOLDER PORT N I START`.
 
-START "new", "resume", or "shared", which is new with a state that all share; "stopped" sends this process SIGTERM in
-its first evaluation, "killed" SIGKILL in its second one; "unreadable:STEP" cannot read the data of an update. It
-evaluates with predictions, which all processes make together, and draws with predictions of its own.
+START "new", "resume", or "shared", which is new with a state that all share, as is "unpictured", which cannot draw;
+"stopped" sends this process SIGTERM in its first evaluation, "killed" SIGKILL in its second one; "unreadable:STEP"
+cannot read the data of an update. It evaluates with predictions, which all processes make together, and draws with
+predictions of its own.
 """
 
 from __future__ import annotations
@@ -69,9 +70,10 @@ def main() -> None:
 
     begin = "resume" if start == "resume" else "new"
     try:
-        config = dataclasses.replace(CONFIG, shard_state=start == "shared")
+        config = dataclasses.replace(CONFIG, shard_state=start in ("shared", "unpictured"))
+        others = {"evaluate": evaluate, "draw": None if start == "unpictured" else draw}
         with processes.leaving():
-            result = run(Path(folder), start=begin, config=config, prepare=prepare, evaluate=evaluate, draw=draw)
+            result = run(Path(folder), start=begin, config=config, prepare=prepare, **others)
     except UserError as error:
         print(json.dumps({"error": str(error)}))
         return

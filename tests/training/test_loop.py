@@ -84,6 +84,29 @@ def test_a_killed_run_resumes_to_the_same_bits(whole, tmp_path):
     assert len(json.loads((folder / "provenance.json").read_text())) == 3
 
 
+@pytest.mark.parametrize("step", [10, 30])
+def test_a_failing_evaluation_loses_no_update_and_a_resumed_run_begins_with_it(whole, tmp_path, step):
+    """Such as for lack of memory: it may be resumed with a smaller evaluation.batch_size."""
+    asked = []
+
+    def failing(params):
+        asked.append(params)
+        if len(asked) == step // 10:
+            raise MemoryError("the device is full")
+        return score(params)
+
+    with pytest.raises(MemoryError):
+        run(tmp_path / "run", evaluate=failing)
+    checkpoints = Checkpoints(tmp_path / "run" / "checkpoints", best_metric="score")
+    assert checkpoints.steps()[-1] == step
+    assert checkpoints.manifest(step).progress["due"]
+    assert run(tmp_path / "run", start="resume").step == 30
+    assert arrays(tmp_path / "run") == arrays(whole)
+    assert timeless(tmp_path / "run") == timeless(whole)
+    assert checkpoints.manifest(30).metrics == score(checkpoints.params(30))
+    assert "due" not in checkpoints.manifest(30).progress
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_finishes_the_step_and_saves_it(whole, tmp_path, number):
     def evaluate_and_signal(params):

@@ -15,7 +15,7 @@ from tflane_jax.datasets.batches import batch_indices
 from tflane_jax.errors import UserError
 from tflane_jax.training import loop
 from tflane_jax.training.checkpoint import Checkpoints
-from tflane_jax.training.provenance import read_provenance, thread_setting
+from tflane_jax.training.provenance import provenance, read_provenance, thread_setting
 from tflane_jax.training.run_folder import check_start, claimed
 
 
@@ -77,6 +77,33 @@ def test_a_resumed_run_may_have_other_workers(tmp_path):
         run(folder, start="resume", resolved=RESOLVED | {"data": {"loading": {"where": "memory"} | workers}})
 
 
+def test_a_resumed_run_may_evaluate_in_other_batches_and_draw_more(tmp_path):
+    folder, settings = tmp_path / "run", {"batch_size": 16, "pictures": 4, "traffic": "own"}
+    run(folder, config=dataclasses.replace(CONFIG, steps=10), resolved=RESOLVED | {"evaluation": settings})
+    run(folder, start="resume", resolved=RESOLVED | {"evaluation": settings | {"batch_size": 2, "pictures": 0}})
+    with pytest.raises(UserError, match=r"evaluation\.traffic: own there, none here"):
+        run(folder, start="resume", resolved=RESOLVED | {"evaluation": settings | {"traffic": "none"}})
+
+
+def test_a_run_is_not_resumed_on_another_number_of_examples(tmp_path):
+    run(tmp_path / "run", config=dataclasses.replace(CONFIG, steps=10), arrays=line_arrays(20))
+    with pytest.raises(UserError, match="was trained on 20 examples, and the training data have 10 now"):
+        run(tmp_path / "run", start="resume", arrays=line_arrays(10))
+    assert run(tmp_path / "run", start="resume", arrays=line_arrays(20)).step == 30
+
+
+def test_checkpoints_without_a_run_are_no_place_for_a_new_one(tmp_path):
+    """Regression: those of the higher steps were kept, and the new run's were deleted."""
+    folder = tmp_path / "run"
+    run(folder)
+    (folder / "config.json").unlink()
+    with pytest.raises(UserError, match=r"holds checkpoints \(step_00000030\), but not the config.json"):
+        run(folder, config=dataclasses.replace(CONFIG, steps=20))
+    assert Checkpoints(folder / "checkpoints").steps()[-1] == 30
+    run(folder, config=dataclasses.replace(CONFIG, steps=20), start="overwrite")
+    assert Checkpoints(folder / "checkpoints").steps()[-1] == 20
+
+
 @pytest.mark.parametrize("kind", ["file", "link to itself"])
 def test_a_run_whose_checkpoints_are_no_folder_is_not_begun_anew(tmp_path, kind):
     (tmp_path / "config.json").touch()
@@ -109,6 +136,22 @@ def test_the_number_of_cores_is_recorded_and_a_change_is_reported(tmp_path, caps
     told = capsys.readouterr().err
     assert "OMP_NUM_THREADS 77: the results are not bit-identical" in told
     assert read_provenance(folder)[-1]["threads"] == thread_setting() == start["threads"] | {"OMP_NUM_THREADS": "77"}
+
+
+def test_other_code_and_packages_are_told_at_a_resume(tmp_path, capsys):
+    folder = tmp_path / "run"
+    run(folder, config=dataclasses.replace(CONFIG, steps=4))
+    (start,) = read_provenance(folder)
+    start["git"] = {"commit": "0123456789abcdef", "uncommitted_changes": True}
+    start["packages"] |= {"jax": "0.4.0", "gone": "1.0"}
+    (folder / "provenance.json").write_text(json.dumps([start]))
+    run(folder, start="resume")
+    (told,) = [line for line in capsys.readouterr().err.splitlines() if "other code" in line]
+    assert "jax 0.4.0 -> " in told
+    assert "gone" not in told
+    assert ("commit 012345678 with uncommitted changes -> " in told) == (provenance()["git"] is not None)
+    run(folder, start="resume")
+    assert "other code" not in capsys.readouterr().err
 
 
 def test_a_checkpoint_is_identified_by_its_content(tmp_path):

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 from tflane_jax.ablations.jobs import Job
 from tflane_jax.ablations.recorded import Facts
-from tflane_jax.training.provenance import read_provenance
+from tflane_jax.training.provenance import commit_of, read_provenance
 from tflane_jax.training.records import read_records
 
 
@@ -18,16 +17,11 @@ def facts(job: Job) -> Facts:
     starts, records = read_provenance(job.folder), read_records(job.folder / "metrics.jsonl")
     seconds = [float(record["seconds"]) for record in records if "seconds" in record]
     return Facts(
-        commits=tuple(sorted({_code(start["git"]) for start in starts if start.get("git")})),
+        commits=tuple(sorted({commit_of(start["git"]) for start in starts if start.get("git")})),
         devices=tuple(sorted({start["device"] for start in starts})),
         seconds=seconds[-1] if seconds else None,
         validation=tuple(record for record in records if record["split"] == "val"),
     )
-
-
-def _code(git: Mapping[str, Any]) -> str:
-    """Return the commit that a run began with, and whether its code was another one."""
-    return git["commit"][:9] + (" with uncommitted changes" if git.get("uncommitted_changes") else "")
 
 
 def row_minutes(trained: Mapping[str, Sequence[Job]]) -> dict[str, float]:

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from tflane_jax.ablations.facts import facts
 from tflane_jax.ablations.jobs import Failure, Job
 from tflane_jax.ablations.results import Results
 from tflane_jax.ablations.scores import CHECKPOINTS, OWN_TEST, measure, with_test_set
@@ -107,7 +108,7 @@ def draw_models(first: RunConfig, models: Mapping[str, Model], pair: Sequence[st
 
 
 def save_plan(plan: Mapping[str, Sequence[Job]], failures: Sequence[Failure], results: Results, out: Path) -> Path:
-    """Write what was compared: identity and folder of every run, failures, scores by seed."""
+    """Write what was compared: identity and folder of every run, commits of the code, failures, scores by seed."""
     content: dict[str, Any] = {
         "seeds": list(results.seeds),
         "tests": {name: list(settings) for name, settings in results.tests.items()},
@@ -115,10 +116,25 @@ def save_plan(plan: Mapping[str, Sequence[Job]], failures: Sequence[Failure], re
             name: [{"folder": str(job.folder), "key": job.key, "threads": dict(job.threads)} for job in planned]
             for name, planned in plan.items()
         },
+        "commits": {name: list(commits(jobs)) for name, jobs in without_failures(plan, failures).items()},
         "failed": [str(failure) for failure in failures],
         "scores": results.by_seed(),
     }
     return write_json(out / "comparison.json", content)
+
+
+def commits(jobs: Sequence[Job]) -> tuple[str, ...]:
+    """Return by which commits runs were trained, in order."""
+    return tuple(sorted({commit for job in jobs for commit in facts(job).commits}))
+
+
+def mixed_code(trained: Mapping[str, Sequence[Job]]) -> str | None:
+    """Return a notice where runs were trained by different commits: a difference of theirs may be the code's."""
+    found = {name: commits(jobs) for name, jobs in trained.items()}
+    if len({commit for each in found.values() for commit in each}) < 2:
+        return None
+    listed = "; ".join(f"{name}: {', '.join(each)}" for name, each in found.items() if each)
+    return f"the runs were trained by different states of the code ({listed}): differences of scores may be theirs"
 
 
 def summary_of(failures: Sequence[Failure], count: int) -> str:

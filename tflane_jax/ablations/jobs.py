@@ -128,9 +128,11 @@ class Job:
         return self.recorded is not None or self.is_at_hand()
 
     def is_at_hand(self) -> bool:
-        """Return whether the folder holds this very run with the checkpoint of its last step."""
-        steps = Checkpoints(self.folder / "checkpoints").steps()
-        return self.exists() and steps[-1:] == [self.config.training.steps] and not self.difference()
+        """Return whether the folder holds this very run with the checkpoint of its last step, and its evaluation."""
+        checkpoints, last = Checkpoints(self.folder / "checkpoints"), self.config.training.steps
+        if not self.exists() or checkpoints.steps()[-1:] != [last] or self.difference():
+            return False
+        return not checkpoints.manifest(last).progress.get("due")
 
     def exists(self) -> bool:
         """Return whether the folder holds a run."""

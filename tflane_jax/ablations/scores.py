@@ -27,7 +27,6 @@ from tflane_jax.evaluation.results import SceneRatio, SceneSamples
 from tflane_jax.files.atomic import write_json
 from tflane_jax.runs import load_test_data, open_run
 from tflane_jax.training.checkpoint import Checkpoints
-from tflane_jax.training.loop import TrainingConfig
 
 CHECKPOINTS: tuple[Which, ...] = ("last", "best")
 OWN_TEST = ""
@@ -44,7 +43,8 @@ def with_test_set(config: RunConfig, settings: Sequence[str]) -> RunConfig:
             raise UserError(f"a test set changes settings of the data (--data...), {name} is none")
     if not settings:
         return config
-    return replace(config, data=with_settings(replace(config, training=TrainingConfig()), tuple(settings)).data)
+    training = replace(config.training, seeds=(0,), init_from=None)  # what all seeds share, for the cache
+    return replace(config, data=with_settings(replace(config, training=training), tuple(settings)).data)
 
 
 @functools.lru_cache(maxsize=256)

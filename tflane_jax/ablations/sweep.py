@@ -44,8 +44,8 @@ def sweep(
         The Markdown file.
 
     Raises:
-        UserError: no run, a setting that is not of the data, a value or override that cannot be set, or an unknown
-            metric; before anything is evaluated.
+        UserError: no run, a setting that is not of the data, a value or override that cannot be set, an unknown
+            metric, or models with different test data; before anything is evaluated.
     """
     if not setting.startswith("data."):
         raise UserError(f"--setting {setting}: give a setting of the data (data...), the models are trained already")
@@ -55,8 +55,10 @@ def sweep(
         value: {name: [_tested(run.config, f"--{setting}", value, *overrides) for run in runs[name]] for name in runs}
         for value in values
     }
-    for config in (config for by_name in tested.values() for each in by_name.values() for config in each):
-        _check_metrics(metrics or (), config.task.score_names(config.data, config.evaluation))
+    for value, by_name in tested.items():
+        _check_same_data(f"{setting} = {value}", by_name)
+        for config in (config for each in by_name.values() for config in each):
+            _check_metrics(metrics or (), config.task.score_names(config.data, config.evaluation))
     scores: dict[str, list[list[dict[str, float]]]] = {name: [] for name in runs}
     protocol = ""
     total = len(values) * sum(map(len, runs.values()))
@@ -104,6 +106,16 @@ def _tested(config: RunConfig, *arguments: str) -> RunConfig:
             f"trained already: got {given}"
         )
     return replace(config, data=changed.data, evaluation=changed.evaluation)
+
+
+def _check_same_data(of: str, tested: Mapping[str, Sequence[RunConfig]]) -> None:
+    named = [(name, config.data.source("test")) for name, configs in tested.items() for config in configs]
+    first, source = named[0]
+    if other := [name for name, each in named if each != source]:
+        raise UserError(
+            f"runs of {first} and {other[0]} have different test data ({of}): their numbers cannot be compared. Give "
+            "the settings that differ to all (such as --data.test 200), or sweep them apart"
+        )
 
 
 def _check_metrics(metrics: Collection[str], known: Collection[str]) -> None:

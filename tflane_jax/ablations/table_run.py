@@ -28,6 +28,7 @@ from tflane_jax.ablations.effects import Tested, judged_claims
 from tflane_jax.ablations.facts import facts, row_minutes
 from tflane_jax.ablations.findings import findings, save_effects
 from tflane_jax.ablations.finished_runs import (
+    commits,
     draw_models,
     evaluate_others,
     first_models,
@@ -231,7 +232,6 @@ def _save_summary(
 ) -> None:
     """Write what docs/results.md is made of."""
     runs = [job for jobs in trained.values() for job in jobs]
-    commits = {commit for job in runs for commit in facts(job).commits}
     write_json(
         folder / "summary.json",
         {
@@ -246,7 +246,7 @@ def _save_summary(
             "declared seeds": len(declared.seeds),
             "steps": {name: jobs[0].config.training.steps for name, jobs in trained.items() if jobs},
             "cores of a run": sorted({job.threads["cores"] for job in runs}),
-            "commits": sorted(commits) + sorted({text for job in runs for text in _measured_elsewhere(job)}),
+            "commits": [*commits(runs), *sorted({text for job in runs for text in _measured_elsewhere(job)})],
             "devices": sorted({device for job in runs for device in facts(job).devices}),
             "core minutes of a run": row_minutes(trained),
             "rows": _rows(table, results),

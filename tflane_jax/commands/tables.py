@@ -16,12 +16,16 @@ from tflane_jax.ablations.tables import TABLES, find_table
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import check_folder
 from tflane_jax.plots.tables import format_table
+from tflane_jax.startup import write
 from tflane_jax.training.run_folder import is_locked
 from tflane_jax.training.runtime import configure_jax
 
 
 def run(options: argparse.Namespace) -> int:
-    """Run the named tables, or list all; without names, --record writes the page of results anew."""
+    """Run the named tables, or list all; without names, --record writes the page of results anew.
+
+    A table that fails does not stop the others; those that are complete are recorded.
+    """
     _check_together(options)
     if options.steps_factor < 1:
         raise UserError(f"--steps-factor {options.steps_factor}: at least 1")
@@ -72,9 +76,18 @@ def run(options: argparse.Namespace) -> int:
     if len(chosen) > 1:  # errors of the last one come before the first one is trained
         for table in chosen:
             plan_table(table, seeds[table.name], options.out, archive=archives.get(table.name), **how)
-    written = [run_table(t, seeds[t.name], options.out, archive=archives.get(t.name), **how) for t in chosen]
-    if options.record is not None:
+    written, failed = [], []
+    for table in chosen:
+        try:
+            written.append(run_table(table, seeds[table.name], options.out, archive=archives.get(table.name), **how))
+        except UserError as error:
+            failed.append(f"{table.name}: {error}")
+            if table is not chosen[-1]:
+                write(f"{failed[-1]}\nthe other tables go on")
+    if options.record is not None and written:
         print("written:", record([path.with_name("summary.json") for path in written], options.record))
+    if failed:
+        raise UserError("\n".join(failed))
     return 0
 
 

@@ -17,6 +17,7 @@ from typing import Annotated, Any
 import numpy as np
 
 from tflane_jax.datasets.batches import Prepare, batches, first_example
+from tflane_jax.datasets.batches import count as example_count
 from tflane_jax.devices import divided, of_one_process, share, training_mesh
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import write_json, write_text
@@ -180,13 +181,14 @@ def train(
         # =============================================================================================================
         # State: fresh, of another run, or resumed
         # =============================================================================================================
-        with stage("making the initial parameters"):
+        with agreed(), stage("making the initial parameters"):
             example = first_example(arrays)
             # Augmentation may change the size of images, and the model takes what it returns.
             example = example if prepare is None else prepare(example, (config.seeds[0], 0, 0))
             states = init_states(task, optimizer, config.seeds, example)
         window, metrics, times = Window(), {}, StepTime()
         memories, started_from = [Memory() for _ in config.seeds], {}
+        examples, due = example_count(arrays), False
         if start == "resume" and (latest := from_first(lambda: _latest(checkpoints))) is not None:
             whole = of_all_seeds(states)
             with stage(f"restoring step {latest['step']}"):
@@ -194,8 +196,14 @@ def train(
             states = per_seed(restored, config.seeds)
             try:
                 window, metrics, times.seconds, memories = _carried(latest["progress"], memories)
+                before, due = int(latest["progress"].get("examples", examples)), bool(latest["progress"].get("due"))
             except WRONG_PROGRESS as error:
                 raise checkpoints.damaged_progress(latest["step"], error) from error
+            if before != examples:
+                raise UserError(
+                    f"{folder} was trained on {before} examples, and the training data have {examples} now: restore "
+                    "them, or start another run (from this one: training.init_from)"
+                )
         elif (origin := config.init_from) is not None:
             fresh = states
             with stage(f"reading {origin}"):
@@ -208,6 +216,8 @@ def train(
         place = partial(placed, mesh=mesh, shard=config.shard_state)
         states = [place(state) for state in states]
         first = step = int(states[0].step)
+
+        drawn = from_first(lambda: draw is not None)
 
         def begin() -> None:
             print_notices(add_provenance(folder, **started_from))
@@ -238,11 +248,11 @@ def train(
         # =============================================================================================================
         # Steps
         # =============================================================================================================
-        def save(evaluated: dict[str, float]) -> None:
-            carried = {"window": asdict(window), "seconds": times.seconds, "metrics": metrics}
+        def save(evaluated: dict[str, float], **more: bool) -> None:
+            carried = {"window": asdict(window), "seconds": times.seconds, "metrics": metrics, "examples": examples}
             if adaptive is not None:
                 carried["cycles"] = [asdict(memory) for memory in memories]
-            manifest = Manifest(step=step, config=resolved, metrics=evaluated, progress=carried)
+            manifest = Manifest(step=step, config=resolved, metrics=evaluated, progress=carried | more)
             kept = of_all_seeds([of_one_process(state) for state in states])
             from_first(lambda: str(checkpoints.save(kept, manifest)))
 
@@ -252,6 +262,36 @@ def train(
             RecordWriter(folder, first) if is_first() else Unwritten() as writer,
             progress_bar(total=config.steps, initial=first, desc=folder.name, unit="step", disable=not progress) as bar,
         ):
+
+            def evaluate_and_save(evaluate: Evaluate) -> None:
+                """Evaluate, let the schedule adapt, write the checkpoint, and draw."""
+                nonlocal states, metrics, memories
+                try:
+                    measured = [evaluate(state.ema_params) for state in states]  # several processes predict together
+                except Exception:
+                    if count() == 1:  # several would wait for one another
+                        save({}, due=True)  # a resumed run begins with this evaluation
+                    raise
+                evaluations = from_first(lambda: measured)
+                writer.write(seed_record(step, "val", scores := by_name(evaluations)))
+                if not metrics and config.best_metric not in scores and is_first():
+                    print_notices([NO_BEST.format(step, config.best_metric)])
+                metrics = {name: float(np.mean(values)) for name, values in scores.items()}
+                if adaptive is not None:
+                    together = of_all_seeds([state.opt_state for state in states])
+                    together, memories, cycles = adapt(adaptive, together, memories, evaluations, config.steps)
+                    changed = per_seed(together, config.seeds)
+                    states = [replace(s, opt_state=place(o)) for s, o in zip(states, changed, strict=True)]
+                    writer.write(seed_record(step, "cycle", cycles))
+                save(metrics)
+                if drawn:
+                    shown = states[0].ema_params  # several processes gather them together
+                    if draw is not None and is_first():
+                        with apart():
+                            draw(folder, step, shown, writer.records)
+
+            if due and evaluate is not None:
+                evaluate_and_save(evaluate)
             while batch is not None and stopped is None:
                 began = time.perf_counter()
                 states, values = update_all(update, states, batch)
@@ -276,25 +316,8 @@ def train(
                     bar.set_postfix_str(f"loss={np.mean(record['loss']):.4g}{times.shown()}", refresh=False)
                     window = Window()
                 if evaluate is not None and (step % config.eval_every == 0 or is_last):
-                    measured = [evaluate(state.ema_params) for state in states]  # several processes predict together
-                    evaluations = from_first(lambda measured=measured: measured)
-                    writer.write(seed_record(step, "val", scores := by_name(evaluations)))
-                    if not metrics and config.best_metric not in scores and is_first():
-                        print_notices([NO_BEST.format(step, config.best_metric)])
-                    metrics = {name: float(np.mean(values)) for name, values in scores.items()}
-                    if adaptive is not None:
-                        together = of_all_seeds([state.opt_state for state in states])
-                        together, memories, cycles = adapt(adaptive, together, memories, evaluations, config.steps)
-                        changed = per_seed(together, config.seeds)
-                        states = [replace(s, opt_state=place(o)) for s, o in zip(states, changed, strict=True)]
-                        writer.write(seed_record(step, "cycle", cycles))
-                    save(metrics)
+                    evaluate_and_save(evaluate)
                     saved_step = step
-                    if draw is not None:
-                        shown = states[0].ema_params  # several processes gather them together
-                        if is_first():
-                            with apart():
-                                draw(folder, step, shown, writer.records)
                 elif step % config.checkpoint_every == 0 or is_last:
                     save({})
                     saved_step = step

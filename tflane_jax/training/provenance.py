@@ -90,17 +90,40 @@ def add_provenance(folder: Path, **more: Any) -> list[str]:
     """Append this start to the run folder's provenance.json, with further entries of plain JSON.
 
     Returns:
-        A line for the user where an earlier start of the run had another thread setting.
+        A line for the user where an earlier start of the run had another thread setting, and one where the latest had
+        other code or packages.
     """
     earlier, new = read_provenance(folder), provenance() | more
     write_json(folder / "provenance.json", [*earlier, new])
+    notices = []
     others = [threads for start in earlier if (threads := threads_of(start)) is not None and threads != new["threads"]]
-    if not others:
-        return []
-    return [
-        f"{folder} was trained with {listed_setting(others[-1])} before, now with {listed_setting(new['threads'])}: "
-        "the results are not bit-identical to those of an uninterrupted run"
-    ]
+    if others:
+        before, now = listed_setting(others[-1]), listed_setting(new["threads"])
+        notices.append(
+            f"{folder} was trained with {before} before, now with {now}: the results are not bit-identical to those of "
+            "an uninterrupted run"
+        )
+    if earlier and (changed := _changes(earlier[-1], new)):
+        notices.append(
+            f"{folder} was trained by other code before ({', '.join(changed)}): the results may differ from those of "
+            "an uninterrupted run"
+        )
+    return notices
+
+
+def commit_of(git: Mapping[str, Any]) -> str:
+    """Return the commit that a run began with, and whether its code was another one."""
+    return git["commit"][:9] + (" with uncommitted changes" if git.get("uncommitted_changes") else "")
+
+
+def _changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
+    """Return which code and packages of two starts differ, as "before -> now"."""
+    pairs = {}
+    if before.get("git") and now.get("git"):
+        pairs["commit"] = commit_of(before["git"]), commit_of(now["git"])
+    old = before.get("packages") or {}
+    pairs |= {name: (old[name], version) for name, version in now["packages"].items() if name in old}
+    return [f"{name} {old} -> {new}" for name, (old, new) in pairs.items() if old != new]
 
 
 def read_provenance(folder: Path) -> list[dict[str, Any]]:

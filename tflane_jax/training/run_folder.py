@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -29,6 +30,8 @@ Start = Literal["new", "resume", "overwrite"]
 CurrentForm = Callable[[dict[str, Any]], tuple[dict[str, Any], list[str]]]
 """Saved configuration (JSON) -> the same in the form of this version, and notices for the user."""
 _COPY = 'A copy is the entry "config" of checkpoints/step_.../manifest.json: write it there, or start with --overwrite'
+_FREE = {"training": ("shard_state",), "evaluation": ("batch_size", "pictures")}
+_STEP = re.compile("step_0*[1-9][0-9]*")  # not step 0, which a conversion that was killed leaves
 _WORKERS = ("threads", "ahead", "processes")  # of `StreamingConfig`
 _CONTENT = (
     "config.json",
@@ -62,10 +65,13 @@ def read_config(folder: Path) -> dict[str, Any]:
 def fixed(config: dict[str, Any]) -> dict[str, Any]:
     """Return a configuration (JSON) without what a resumed run may change.
 
-    That is where the devices hold its state, and the workers that load examples: no batch depends on these.
+    That is where the devices hold its state, the workers that load examples, and what an evaluation needs of memory and
+    draws: neither batches nor scores depend on these.
     """
-    training = {name: value for name, value in config.get("training", {}).items() if name != "shard_state"}
-    config = config | {"training": training}
+    config = dict(config)
+    for part, names in _FREE.items():
+        if isinstance(settings := config.get(part), dict):
+            config[part] = {name: value for name, value in settings.items() if name not in names}
     if isinstance(loading := value_at(config, "data.loading"), dict):
         others = {name: value for name, value in loading.items() if name not in _WORKERS}
         config |= {"data": config["data"] | {"loading": others}}
@@ -135,6 +141,11 @@ def check_start(folder: Path, start: Start) -> None:
             f"{folder} already holds a run: continue it with --resume, replace it with --overwrite, "
             "or choose another folder with --out"
         )
+    if start == "new" and (left := sorted(filter(_STEP.fullmatch, _names(folder / "checkpoints")))):
+        raise UserError(
+            f"{folder} holds checkpoints ({left[-1]}), but not the config.json of their run: replace them with "
+            "--overwrite, delete the folder, or choose another one with --out"
+        )
     if start == "resume" and not holds_run:
         raise UserError(f"{folder} holds no run to resume: leave --resume out to start one")
     checkpoints = folder / "checkpoints"
@@ -145,13 +156,16 @@ def check_start(folder: Path, start: Start) -> None:
             f"{links[0]} is a link, and what it points to is not deleted: remove the link, or choose another folder "
             "with --out"
         )
+    # A process killed while it wrote the first file leaves a temporary one: still no foreign file.
+    if not holds_run and (other := {name for name in _names(folder) if not is_temporary(name)} - set(_CONTENT)):
+        raise UserError(f"{folder} is not empty ({min(other)}) and holds no run: choose another folder with --out")
+
+
+def _names(folder: Path) -> list[str]:
     try:
-        found = {p.name for p in folder.iterdir()} if folder.is_dir() else set()
+        return [p.name for p in folder.iterdir()] if folder.is_dir() else []
     except OSError as error:
         raise UserError(f"cannot read {folder}: {error.strerror or error}") from error
-    # A process killed while it wrote the first file leaves a temporary one: still no foreign file.
-    if not holds_run and (other := {name for name in found if not is_temporary(name)} - set(_CONTENT)):
-        raise UserError(f"{folder} is not empty ({min(other)}) and holds no run: choose another folder with --out")
 
 
 def _lock(file: int, folder: Path) -> None:

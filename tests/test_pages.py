@@ -2,6 +2,8 @@
 
 import re
 import shlex
+import sys
+import types
 from collections.abc import Iterator
 from functools import cache
 from types import SimpleNamespace
@@ -12,7 +14,6 @@ import numpy as np
 import pytest
 
 from tests.models.cases import BASELINE, make_example
-from tests.models.toy_host import ToyHostConfig, ToyHostLossConfig
 from tests.parameters import random_params
 from tests.shared import ROOT
 from tests.training.stub import LineDataset, LineTask, line_arrays
@@ -114,17 +115,38 @@ def test_wrong_commands_are_found(command, said):
 
 
 def test_configurations_in_pages_can_be_trained():
-    """Names of the reader's own host, which the page writes above, are those of the tests' host."""
-    own = {"PlainDetrConfig": ToyHostConfig, "PlainDetrLossConfig": ToyHostLossConfig}
     found = 0
     for text in PAGES.values():
         for block in re.findall(r"^```python\n(.*?)^```", text, re.DOTALL | re.MULTILINE):
             if re.search(r"import .*RunConfig", block) and "def get_config" in block:
-                names: dict[str, Any] = dict(own)
-                exec(block, names)
-                check_frozen(names["get_config"]())
+                check_frozen(defined(block)["get_config"]())
                 found += 1
     assert found > 1
+
+
+def test_the_host_of_the_page_has_losses_and_gradients():
+    """Regression: the page lacked imports and an argument."""
+    (block,) = python_blocks("docs/architecture.md", "class PlainDetr(Host)")
+    config = defined(block)["get_config"]()
+    example = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), config.task.shapes(config.data))
+    batch = jax.tree.map(lambda leaf: leaf[None], example)
+
+    def trained(key):
+        params = config.task.init(key, example)
+        return jax.grad(config.task.loss, has_aux=True)(params, batch, key), config.task.predict(params, example)
+
+    (_, terms), prediction = jax.eval_shape(trained, jax.random.key(0))
+    assert "points" in terms
+    assert prediction.centerlines.points.shape == (50, 11, 3)
+
+
+def defined(block: str) -> dict[str, Any]:
+    """Run a block of Python as a module, and return its names."""
+    module = types.ModuleType("page")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(sys.modules, "page", module)  # where dataclasses look for it
+        exec(block, module.__dict__)
+    return module.__dict__
 
 
 def test_commands_behind_blocks_of_python_are_found():

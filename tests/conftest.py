@@ -68,3 +68,15 @@ def _programs_in_memory():
 def pytest_collection_modifyitems(items):
     """Run whole commands and notebooks first: few tests, but long ones, with which no worker should end alone."""
     items.sort(key=lambda item: len(item.path.parts))
+
+
+@pytest.fixture
+def own_sources():
+    """Forget the data sources that a test adds."""
+    from tflane_jax.datasets import sources
+
+    before = list(sources.SOURCES)
+    yield
+    sources.SOURCES[:] = before
+    for tell in sources._told:
+        tell()

@@ -18,6 +18,7 @@ from tests.parameters import random_params
 from tests.shared import ROOT
 from tests.training.stub import LineDataset, LineTask, line_arrays
 from tflane_jax.cli import build_parser
+from tflane_jax.commands.sources import source_for
 from tflane_jax.config import RunConfig, load_config
 from tflane_jax.config_overrides import apply_overrides
 from tflane_jax.datasets import sources
@@ -114,6 +115,7 @@ def test_wrong_commands_are_found(command, said):
     assert said in (fault(words) or "")
 
 
+@pytest.mark.usefixtures("own_sources")
 def test_configurations_in_pages_can_be_trained():
     found = 0
     for text in PAGES.values():
@@ -138,6 +140,34 @@ def test_the_host_of_the_page_has_losses_and_gradients():
     (_, terms), prediction = jax.eval_shape(trained, jax.random.key(0))
     assert "points" in terms
     assert prediction.centerlines.points.shape == (50, 11, 3)
+
+
+@pytest.mark.usefixtures("own_sources")
+def test_the_dataset_of_the_page_is_read_trained_on_and_checked(tmp_path, monkeypatch):
+    """Regression: it took its own sizes in place of the run's, and could not be copied from the tests."""
+    (block,) = python_blocks("docs/architecture.md", "class MyDataset")
+    names = defined(block)
+    monkeypatch.chdir(tmp_path)
+    config = names["get_config"]()
+    grid = config.data.example.sensor.grid
+    lines = [[[-30.0, 0.0, 0.0], [0.0, 0.0, 0.0]], [[0.0, 0.0, 0.0], [30.0, 0.0, 0.0]]]
+    for split in ("train", "val", "test"):
+        folder = tmp_path / "drives" / split
+        folder.mkdir(parents=True)
+        np.savez(folder / "0.npz", lines=lines, bev=np.zeros((grid.rows, grid.columns, 4), np.uint8))
+    assert sources.named_source("mine").check(tmp_path / "drives").faults == []
+    check_run(config)
+    loaded = config.task.load(config.data.source("train"), progress=False)
+    config.task.check(config.data, loaded)
+    assert loaded.lanes.successor[0, 0, 1]
+    assert loaded.lanes.valid.sum() == 2
+    trained = load_config("tf_lane/toponet:street")  # another box
+    choice = names["Choice"]("test", False, trained.data.source("test"), tmp_path / "drives")
+    assert names["choose"](choice).example == trained.data.example
+    run = SimpleNamespace(config=trained)
+    options = {"data": "mine", "root": str(tmp_path / "drives"), "openlane": None, "split": None}
+    with pytest.raises(UserError, match="a raster of 100 x 200"):
+        source_for(run, SimpleNamespace(default_split="test", **options))
 
 
 def defined(block: str) -> dict[str, Any]:

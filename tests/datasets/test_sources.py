@@ -1,7 +1,6 @@
 """The list of data sources: a new dataset costs one file and one entry, and no source ignores --split."""
 
 import json
-import re
 import shutil
 import subprocess
 import sys
@@ -293,17 +292,7 @@ def test_tusimples_folder_is_checked(tmp_path, capsys):
     assert "| train |      2 |           2 |" in capsys.readouterr().out
 
 
-@pytest.fixture
-def unchanged():
-    """Forget the sources that a test adds."""
-    before = list(sources.SOURCES)
-    yield
-    sources.SOURCES[:] = before
-    for tell in sources._told:
-        tell()
-
-
-@pytest.mark.usefixtures("unchanged")
+@pytest.mark.usefixtures("own_sources")
 def test_a_dataset_is_added_from_outside(tmp_path):
     """After a configuration was checked, so that its types are known already."""
     own = RunConfig(data=toy_source.ToyData(tmp_path))
@@ -334,16 +323,8 @@ def test_a_dataset_is_added_from_outside(tmp_path):
         sources.add_source(replace(toy_source.SOURCE, name="tusimple"))
 
 
-@pytest.mark.usefixtures("unchanged")
+@pytest.mark.usefixtures("own_sources")
 def test_a_source_without_a_check_of_its_folder_is_refused(tmp_path, capsys):
     sources.add_source(replace(toy_source.SOURCE, check=None))
     assert main(["data", "check", "--format", "toy", str(tmp_path)]) == 2
     assert "tflane: --format toy has no check of a folder: choose one of argoverse2, " in capsys.readouterr().err
-
-
-@pytest.mark.usefixtures("unchanged")
-def test_the_dataset_of_the_page_is_added():
-    page = (ROOT / "docs" / "architecture.md").read_text("utf-8")
-    (code,) = [block for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "class ToyDataset" in block]
-    exec(compile(code, "architecture.md", "exec"), vars(toy_source) | {"sources": sources})
-    assert sources.named_source("toy").check is not None

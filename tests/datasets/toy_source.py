@@ -1,4 +1,4 @@
-"""A complete new dataset in one file. `test_sources` adds its one entry to the list of sources."""
+"""A new dataset of made-up examples, all of one size. `test_sources` adds its one entry to the list of sources."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,7 +35,10 @@ class ToyDataset:
         return self._count
 
     def example(self, index: int) -> Example:
-        return fake_example(index + 1000 * SPLITS.index(self.config.split))
+        sensor = self.config.example.sensor
+        assert sensor is not None
+        bev = np.zeros((sensor.grid.rows, sensor.grid.columns, 4), np.uint8)
+        return fake_example(index + 1000 * SPLITS.index(self.config.split)).replace(bev=bev)
 
     def info(self, index: int) -> FrameInfo:
         return FrameInfo("toy", f"{self.config.split} scene", index, np.eye(4))
@@ -54,7 +57,7 @@ class ToyData:
 
 def choose(choice: Choice) -> ToyConfig:
     assert choice.root is not None
-    return ToyConfig(choice.root, choice.split)
+    return ToyConfig(choice.root, choice.split, choice.configured.example)
 
 
 def check(root: Path) -> FolderCheck:

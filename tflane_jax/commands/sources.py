@@ -13,14 +13,23 @@ from tflane_jax.config import RunConfig, load_config
 from tflane_jax.datasets import argoverse2
 from tflane_jax.datasets.base import SPLITS, Split, TrafficRateWarning
 from tflane_jax.datasets.data_source import Choice, DataSource
-from tflane_jax.datasets.sources import SOURCES, history_hz, named_source, source_name, source_names, source_of
+from tflane_jax.datasets.sources import (
+    SOURCES,
+    history_hz,
+    is_shipped,
+    named_source,
+    sample,
+    source_name,
+    source_names,
+    source_of,
+)
 from tflane_jax.errors import UserError
 from tflane_jax.files.folders import named_folder
 from tflane_jax.models.host import HostConfig
 from tflane_jax.run_checks import EXAMPLE_NAMES, check_kind
 from tflane_jax.runs import Run, open_run, open_weights
 from tflane_jax.scene import Example, RoadImage
-from tflane_jax.tasks.fit import check_settings_fit, reads_traffic
+from tflane_jax.tasks.fit import check_raster, check_settings_fit, reads_traffic
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.tasks.lane_shape import LaneShapeTask
 from tflane_jax.tasks.traffic import limit_instances
@@ -140,14 +149,18 @@ def source_for(run: Run, options: argparse.Namespace) -> Any:
 def _check_world(run: Run, source: Any, options: argparse.Namespace) -> None:
     """Raise UserError for a world that does not fit the model."""
     task = run.config.task
-    if options.data is None or named_source(options.data).root is not None or not isinstance(task, LaneGraphTask):
+    if options.data is None or not isinstance(task, LaneGraphTask):
         return
-    cameras = source.example.cameras
+    if (named := named_source(options.data)).root is not None and is_shipped(named):  # it takes the run's sizes
+        return
+    images = source.example.cameras or getattr(source, "image", None)
     try:
-        check_settings_fit(task.model, source.example, image_scale=None if cameras is None else cameras.scale)
+        check_settings_fit(task.model, source.example, image_scale=None if images is None else images.scale)
     except UserError as error:
         why = str(error).rpartition(": ")[0]  # without the remedy, which is for trainings
         raise UserError(f"--data {options.data} does not fit this model: {why}; choose data like its own") from None
+    if named.root is not None:
+        check_raster(source, sample(source))
 
 
 def _check_traffic(run: Run, source: Any) -> None:

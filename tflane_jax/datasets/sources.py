@@ -62,6 +62,11 @@ def add_source(source: DataSource[Any]) -> None:
         tell()
 
 
+def is_shipped(source: DataSource[Any]) -> bool:
+    """Return whether a source is one of the package."""
+    return source in _SHIPPED
+
+
 def when_added(tell: Callable[[], None]) -> None:
     """Call a function whenever a source is added."""
     _told.append(tell)

@@ -7,6 +7,8 @@ from operator import attrgetter
 import numpy as np
 
 from tflane_jax.datasets.base import ExampleConfig
+from tflane_jax.datasets.data_source import LaneGraphSource
+from tflane_jax.datasets.sources import source_name
 from tflane_jax.errors import UserError
 from tflane_jax.models.bev_encoder import BevFormerConfig
 from tflane_jax.models.bevformer import check_capacity
@@ -54,6 +56,18 @@ def check_fit(model: HostConfig, example: Example) -> None:
         seen = model.in_host_frame(example).cameras
         assert seen is not None
         check_capacity(encoder.bev, seen)
+
+
+def check_raster(source: LaneGraphSource, example: Example) -> None:
+    """Raise UserError where the evidence of an example has not the size that its source says: it is of another box."""
+    if example.bev is None or (sensor := source.example.sensor) is None:
+        return
+    (rows, columns, *_), grid = example.bev.shape, sensor.grid
+    if (rows, columns) != (grid.rows, grid.columns):
+        raise UserError(
+            f"examples of {source_name(source)} have a raster of {rows} x {columns}, and their configuration says "
+            f"{grid.rows} x {grid.columns} (example.sensor.grid): a dataset makes examples of the sizes in `example`"
+        )
 
 
 def _check_elements(model: HostConfig, example: Example) -> None:

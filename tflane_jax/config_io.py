@@ -38,10 +38,12 @@ def settings(config: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
 
 def to_text(config: Any) -> str:
     """Return one line `a.b.c = value` per setting; a nested configuration's own line names its class."""
-    return "".join(
-        f"{name} = {type(value).__name__ if dataclasses.is_dataclass(value) else repr(_plain(value))}\n"
-        for name, value in settings(config)
-    )
+    return "".join(f"{name} = {value_text(value)}\n" for name, value in settings(config))
+
+
+def value_text(value: Any) -> str:
+    """Return the value of a setting as text; of a nested configuration, its class."""
+    return type(value).__name__ if dataclasses.is_dataclass(value) else repr(_plain(value))
 
 
 def to_json(config: Any) -> dict[str, Any]:

@@ -15,7 +15,8 @@ import jax
 from tflane_jax import processes
 from tflane_jax.config import RunConfig, load_config
 from tflane_jax.config_files import split_reference
-from tflane_jax.config_io import from_json, to_json, to_text
+from tflane_jax.config_help import explained
+from tflane_jax.config_io import from_json, to_json
 from tflane_jax.config_overrides import apply_overrides, batch_notices
 from tflane_jax.errors import UserError
 from tflane_jax.own_modules import imports_of
@@ -32,7 +33,7 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> int:
     if options.wants_help:
         print(options.usage)
         if options.config:
-            print(f"settings of {options.config}:\n\n{to_text(load_config(options.config))}")
+            print(f"settings of {options.config}:\n\n{explained(load_config(options.config))}")
         return 0
     if options.config is None and options.start != "resume":
         raise UserError("say what to train: --config FILE (or a name, say tf_lane/toponet), or --resume with --out RUN")

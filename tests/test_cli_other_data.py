@@ -12,7 +12,7 @@ import pytest
 from tests.tiny_run import CONFIG, use_fakes
 from tflane_jax.cli import main
 from tflane_jax.commands import submit
-from tflane_jax.commands.sources import data_name, model_title
+from tflane_jax.commands.sources import chosen_source, data_name, model_title
 from tflane_jax.config import LogData, NuScenesData, RunConfig, WorldData, load_config
 from tflane_jax.datasets.base import ExampleConfig, MarkerConfig, TrafficRateWarning
 from tflane_jax.datasets.data_source import Choice
@@ -52,6 +52,19 @@ def test_other_worlds_do_not_replace_the_tables_of_the_own_one(trained, capsys):
         written = json.loads((trained / "evaluations" / f"{world}-test-step4.json").read_text())
         assert written["meta"]["source"]["scenes"] == 100
     assert (trained / "evaluations" / "procedural-test-step4.md").read_text() == own
+
+
+def test_a_part_of_openlane_v2_is_chosen_by_its_split_file(tmp_path):
+    """Regression: the message of missing frames named a setting that `eval` refused."""
+    (tmp_path / "data_dict_subset_A.json").write_text("{}")
+    given = {"data": "openlane-v2", "root": str(tmp_path), "openlane": None, "split": None, "default_split": "test"}
+    options = argparse.Namespace(**given, data_dict="folders")
+    source = chosen_source(RunConfig(), options)
+    assert source.data_dict == "folders"
+    assert data_name(source, options) == f"openlane-v2-A-test-folders-{tmp_path.name}"
+    options = argparse.Namespace(**given | {"data": "city", "root": None}, data_dict="folders")
+    with pytest.raises(UserError, match="--data-dict chooses the frames of OpenLane-V2"):
+        chosen_source(RunConfig(), options)
 
 
 @pytest.mark.parametrize("command", ["eval", "predict"])
@@ -106,7 +119,7 @@ def test_a_preset_has_the_priors_and_the_truth_that_the_model_reads(name):
     ],
 )
 def test_other_worlds_folders_and_splits_have_other_names(source, given, name):
-    options = {"data": None, "root": None, "split": None, "default_split": "test"} | given
+    options = {"data": None, "root": None, "split": None, "default_split": "test", "data_dict": None} | given
     assert data_name(source, argparse.Namespace(**options)) == name
 
 
@@ -125,7 +138,7 @@ def test_pictures_of_a_run_in_a_store_name_its_model(folder, config, title):
 def test_what_only_one_server_takes_is_refused_elsewhere(monkeypatch, tmp_path):
     config = RunConfig(data=NuScenesData(tmp_path / "nowhere"))
     monkeypatch.setattr(submit, "opened", lambda options: (SimpleNamespace(config=config), []))
-    given = {"data": None, "root": None, "split": None, "default_split": "test", "openlane": None}
+    given = {"data": None, "root": None, "split": None, "default_split": "test", "openlane": None, "data_dict": None}
     told = {"method": "", "authors": [], "email": "", "institution": "", "country": "CH", "team": ""}
     with pytest.raises(UserError, match="--country is for OpenLane-V2's server"):
         submit.run(argparse.Namespace(out=tmp_path / "out.json", **given, **told))

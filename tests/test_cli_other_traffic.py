@@ -22,7 +22,7 @@ AT_2_HZ = ExampleConfig(history_hz=2.0)
 
 
 def chosen(config: RunConfig, *, data=None, root=None):
-    options = argparse.Namespace(data=data, root=root, split=None, default_split="test", openlane=None)
+    options = argparse.Namespace(data=data, root=root, split=None, default_split="test", openlane=None, data_dict=None)
     return source_for(Run("run", config, 3, ()), options)
 
 

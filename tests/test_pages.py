@@ -165,7 +165,7 @@ def test_the_dataset_of_the_page_is_read_trained_on_and_checked(tmp_path, monkey
     choice = names["Choice"]("test", False, trained.data.source("test"), tmp_path / "drives")
     assert names["choose"](choice).example == trained.data.example
     run = SimpleNamespace(config=trained)
-    options = {"data": "mine", "root": str(tmp_path / "drives"), "openlane": None, "split": None}
+    options = {"data": "mine", "root": str(tmp_path / "drives"), "openlane": None, "split": None, "data_dict": None}
     with pytest.raises(UserError, match="a raster of 100 x 200"):
         source_for(run, SimpleNamespace(default_split="test", **options))
 

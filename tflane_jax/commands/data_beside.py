@@ -48,7 +48,9 @@ def beside(config: RunConfig, options: argparse.Namespace) -> int:
         name, _, root = text.partition("=")
         openlane = options.openlane if name == _READS_OPENLANE else None
         split = None if name == recorded_logs.SOURCE.name else options.split  # a folder of recordings has no splits
-        source = chosen_source(config, _with(options, data=name, root=root or None, openlane=openlane, split=split))
+        source = chosen_source(
+            config, _with(options, data=name, root=root or None, openlane=openlane, split=split, data_dict=None)
+        )
         _check(source)
         chosen[_unused(name, chosen)] = replace(source, example=_same(first.example, source))
     values, counts = {}, {}

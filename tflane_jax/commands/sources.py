@@ -10,7 +10,7 @@ from typing import Any
 
 from tflane_jax.ablations.store import is_key
 from tflane_jax.config import RunConfig, load_config
-from tflane_jax.datasets import argoverse2
+from tflane_jax.datasets import argoverse2, openlane_v2
 from tflane_jax.datasets.base import SPLITS, Split, TrafficRateWarning
 from tflane_jax.datasets.data_source import Choice, DataSource
 from tflane_jax.datasets.sources import (
@@ -103,7 +103,9 @@ def with_chosen_topology(run: Run, options: argparse.Namespace) -> Run:
 
 
 def chosen_source(config: RunConfig, options: argparse.Namespace, split: Split | None = None) -> Any:
-    """Return the data selected by --split, --data, --root and --openlane: a configuration of `datasets.sources`.
+    """Return the data selected by --split, --data, --root, --openlane and --data-dict.
+
+    It is a configuration of `datasets.sources`.
 
     Without --data and --root, this is the configuration's split. With --data, sizes of examples stay as configured; the
     presets of the built-in world have their own box, history and capacities.
@@ -125,13 +127,18 @@ def chosen_source(config: RunConfig, options: argparse.Namespace, split: Split |
     source = source_of(configured) if options.data is None else named_source(options.data)
     if options.openlane is not None and (options.root is None or source is not argoverse2.SOURCE):
         raise UserError("--openlane chooses the frames of --data argoverse2 with --root: other data do not read it")
-    if options.data is None and options.root is None:
-        return configured
-    _check_choice(source, kind, options)
-    # The name of a folder may be that of a split.
-    root = None if options.root is None else named_folder(options.root)
-    openlane = None if options.openlane is None else Path(options.openlane)
-    return source.choose(Choice(chosen, given is not None, configured, root, openlane, option))
+    found = configured
+    if options.data is not None or options.root is not None:
+        _check_choice(source, kind, options)
+        # The name of a folder may be that of a split.
+        root = None if options.root is None else named_folder(options.root)
+        openlane = None if options.openlane is None else Path(options.openlane)
+        found = source.choose(Choice(chosen, given is not None, configured, root, openlane, option))
+    if options.data_dict is None:
+        return found
+    if source is not openlane_v2.SOURCE:
+        raise UserError("--data-dict chooses the frames of OpenLane-V2: other data do not read it")
+    return replace(found, data_dict=options.data_dict)
 
 
 def source_for(run: Run, options: argparse.Namespace) -> Any:
@@ -189,6 +196,8 @@ def data_name(source: Any, options: argparse.Namespace) -> str:
         return f"{options.data}-{options.split or options.default_split}"
     if options.split is not None and not set(SPLITS) & set(name.split("-")):
         name = f"{name}-{options.split}"
+    if options.data_dict is not None:
+        name = f"{name}-{Path(options.data_dict).stem}"
     folder = "" if options.root is None else Path(options.root).resolve().name
     return name if f"-{folder}-" in f"-{name}-" or not folder else f"{name}-{folder}"
 

@@ -122,8 +122,8 @@ class OpenLaneV2Dataset:
         if missing:
             raise UserError(
                 f"{self.root}: {len(missing)} of {len(self.keys)} frames are missing ({missing[0]}{self._suffixes[0]}"
-                ".json, ...): unpack them, name a split file of those at hand (data_dict), or take what is there "
-                '(data_dict="folders")'
+                ".json, ...): unpack them, name a split file of those at hand (data.data_dict, or --data-dict of "
+                "eval, predict and submit), or take what is there (data_dict folders)"
             )
         if config.map_changes == "drop":
             self.keys = without_map_changes(self.root, self.keys, self._suffixes[0])

@@ -126,3 +126,8 @@ def source_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--openlane", metavar="PATH", help="folder of the OpenLane-V2 split files, which --data argoverse2 can use"
     )
+    parser.add_argument(
+        "--data-dict",
+        metavar="FILE",
+        help="OpenLane-V2: split file below the root; 'folders': all frames that are there",
+    )

@@ -44,7 +44,7 @@ FLOORS = (
     "tasks",
     "convert",
     "config",
-    "config_overrides",
+    "config_overrides config_help",
     "run_checks training_nearness",
     "runs",
     "summary export",

@@ -29,6 +29,14 @@ def explained(config: Any) -> str:
     return "\n".join(lines) + "\n"
 
 
+def meaning(config: Any, name: str) -> str:
+    """Return what the setting of that dotted name means, as in `explained`; "" for none."""
+    *parts, last = name.split(".")
+    for part in parts:
+        config = getattr(config, part, None)
+    return meanings(type(config)).get(last, "")
+
+
 @cache
 def meanings(kind: type) -> dict[str, str]:
     """Return what the docstring of a class, or of its bases, says of each attribute; of long texts a sentence."""

@@ -11,6 +11,7 @@ from typing import Literal
 from tflane_jax.ablations.comparison import compact
 from tflane_jax.ablations.scores import with_settings
 from tflane_jax.config import RunConfig
+from tflane_jax.config_help import meaning
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import check_folder
 from tflane_jax.plots.tables import format_table, save_table
@@ -90,7 +91,8 @@ def sweep(
     if importlib.util.find_spec("matplotlib") is not None:
         from tflane_jax.plots.sweep import save_sweep
 
-        written.append(save_sweep(out / "sweep.png", scores, setting, values, metrics))
+        first = next(iter(runs.values()))[0].config
+        written.append(save_sweep(out / "sweep.png", scores, setting, values, metrics, meaning=meaning(first, setting)))
     print("\nwritten:", *written, sep="\n  ")
     return written[0]
 

@@ -13,6 +13,7 @@ from jaxtyping import Float, Int
 from tflane_jax.errors import UserError
 from tflane_jax.plots import style
 from tflane_jax.plots.figure import columns_for, hide_unused, new_figure, save_figure
+from tflane_jax.plots.names import score_title
 from tflane_jax.plots.tables import counted
 
 if TYPE_CHECKING:
@@ -98,7 +99,7 @@ def save_comparison_curves(
     figure, axes = new_figure(-(-len(panels) // columns), columns, panel=size, footer=0.3 + 0.1 * len(found))
     styles = _styles(found)  # the same in all panels
     for ax, (name, series) in zip(axes.flat, panels.items(), strict=False):
-        ax.set_title(f"validation: {name}, percent", fontsize=9, loc="left")
+        ax.set_title(f"validation: {score_title(name)}, percent", fontsize=9, loc="left")
         _draw_panel(ax, series, styles)
     hide_unused(axes, len(panels))
     lines = {str(line.get_label()): line for ax in axes.flat for line in ax.lines}

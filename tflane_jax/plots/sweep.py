@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -9,13 +10,16 @@ import numpy as np
 
 from tflane_jax.plots import style
 from tflane_jax.plots.figure import columns_for, hide_unused, new_figure, save_figure
+from tflane_jax.plots.names import score_title
 from tflane_jax.plots.tables import counted
 
 Scores = Mapping[str, Sequence[Sequence[Mapping[str, float]]]]
 """By model: for each value of the setting, for each seed, metrics by name."""
 
 
-def save_sweep(path: Path, scores: Scores, setting: str, values: Sequence[str], metrics: Sequence[str]) -> Path:
+def save_sweep(
+    path: Path, scores: Scores, setting: str, values: Sequence[str], metrics: Sequence[str], *, meaning: str = ""
+) -> Path:
     """Write one panel per metric: for each model the mean of its seeds and a band of one standard deviation.
 
     The legend says what the bands are, and how many seeds a model has.
@@ -25,6 +29,7 @@ def save_sweep(path: Path, scores: Scores, setting: str, values: Sequence[str], 
         scores: fractions, shown as percent; see `Scores`.
         setting, values: name and values of the horizontal axis; values that are no numbers are evenly spaced.
         metrics: names of the metrics to draw.
+        meaning: of the setting, in words, below its name.
     """
     try:
         places, ticks = np.array([float(value) for value in values]), None
@@ -41,8 +46,8 @@ def save_sweep(path: Path, scores: Scores, setting: str, values: Sequence[str], 
             label = f"{model} ({counted(max(map(len, by_value)), 'seed')})"
             ax.plot(places, mean, **look, marker="o", ms=3, lw=1.4, label=label)
             ax.fill_between(places, mean - spread, mean + spread, color=look["color"], alpha=0.15, lw=0)
-        ax.set_title(f"{metric}, percent", fontsize=9, loc="left")
-        ax.set_xlabel(setting, fontsize=8)
+        ax.set_title(f"{score_title(metric)}, percent", fontsize=9, loc="left")
+        ax.set_xlabel("\n".join([setting, *textwrap.wrap(meaning, 52)]), fontsize=8)
         if ticks is not None:
             ax.set_xticks(places, ticks)
         ax.tick_params(labelsize=7)

@@ -199,7 +199,8 @@ def sweep(commands) -> None:
     parser.add_argument(
         "--metrics", nargs="+", help="scores to show, such as all/DET_l gap/recall (default: those of compare)"
     )
-    parser.add_argument("--checkpoint", choices=("last", "best"), default="last", help="default last")
+    chosen = "default last; `eval` and `predict`: best"
+    parser.add_argument("--checkpoint", choices=("last", "best"), default="last", help=chosen)
     parser.add_argument("--out", metavar="DIR", type=Path, default=Path("runs/sweep"), help="default runs/sweep")
     parser.set_defaults(takes_overrides=True)
 

@@ -15,10 +15,13 @@ if TYPE_CHECKING:
 
 def visibility_entries() -> list:
     """Return the entries of a legend for true lanes by what the sensor can see of them."""
+    from matplotlib.colors import to_rgb
     from matplotlib.lines import Line2D
 
+    between = [sum(ends) / 2 for ends in zip(to_rgb(style.LANE_CLEAR), to_rgb(style.LANE_HIDDEN), strict=True)]
     return [
         Line2D([], [], color=style.LANE_CLEAR, lw=2, label="lane in sight"),
+        Line2D([], [], color=between, lw=2, label="in part"),
         Line2D([], [], color=style.LANE_HIDDEN, lw=2, label="lane out of sight"),
     ]
 

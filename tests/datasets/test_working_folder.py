@@ -40,7 +40,13 @@ def test_the_folder_of_a_split_is_that_split(tmp_path, monkeypatch):
     folder.mkdir()
     monkeypatch.chdir(folder)
     options = argparse.Namespace(
-        data="argoverse2", root=Path("."), split="val", default_split="test", openlane=None, config=None
+        data="argoverse2",
+        root=Path("."),
+        split="val",
+        default_split="test",
+        openlane=None,
+        data_dict=None,
+        config=None,
     )
     assert chosen_source(RunConfig(), options).root == folder
 

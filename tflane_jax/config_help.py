@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import inspect
 import re
 import textwrap
@@ -20,13 +19,8 @@ _WIDTH, _COLUMN = 120, 62
 
 def explained(config: Any) -> str:
     """Return every setting with its value and, behind it, what its class says of it, or the first sentence of that."""
-    parts, lines = {"": config}, []
-    for name, value in settings(config):
-        if dataclasses.is_dataclass(value):
-            parts[name] = value
-        part, _, last = name.rpartition(".")
-        lines += _row(f"{name} = {value_text(value)}", meanings(type(parts[part])).get(last, ""))
-    return "\n".join(lines) + "\n"
+    rows = (_row(f"{name} = {value_text(value)}", meaning(config, name)) for name, value in settings(config))
+    return "".join(f"{line}\n" for row in rows for line in row)
 
 
 def meaning(config: Any, name: str) -> str:
@@ -59,10 +53,9 @@ def meanings(kind: type) -> dict[str, str]:
 
 
 def _row(setting: str, meaning: str) -> list[str]:
-    comment = textwrap.wrap(meaning, _WIDTH - _COLUMN - 2, break_long_words=False, break_on_hyphens=False)
-    if not comment:
-        return [setting]
-    left = [setting] if len(setting) < _COLUMN else [setting, ""]
-    left += [""] * (len(comment) - 1)
-    right = ([""] if len(setting) >= _COLUMN else []) + [f"# {line}" for line in comment]
-    return [f"{first:<{_COLUMN}}{second}".rstrip() for first, second in zip(left, right, strict=True)]
+    """Return the setting with its meaning beside it, or below it where it is too long for that."""
+    width = _WIDTH - _COLUMN - 2
+    comment = [f"# {line}" for line in textwrap.wrap(meaning, width, break_long_words=False, break_on_hyphens=False)]
+    if comment and len(setting) < _COLUMN:
+        setting = f"{setting:<{_COLUMN}}{comment.pop(0)}"
+    return [setting, *(" " * _COLUMN + line for line in comment)]

@@ -132,7 +132,9 @@ class Job:
         checkpoints, last = Checkpoints(self.folder / "checkpoints"), self.config.training.steps
         if not self.exists() or checkpoints.steps()[-1:] != [last] or self.difference():
             return False
-        return not checkpoints.manifest(last).progress.get("due")
+        with contextlib.suppress(UserError):  # a damaged one is told where its run is used
+            return not checkpoints.manifest(last).progress.get("due")
+        return True
 
     def exists(self) -> bool:
         """Return whether the folder holds a run."""

@@ -108,8 +108,8 @@ def with_torch_biases(variables: Any, key: PRNGKeyArray) -> Any:
     """Return initial variables in which biases that the published code leaves alone start as in PyTorch.
 
     They are uniform within 1 / sqrt(inputs): those of the feed-forward networks in encoder and decoders, of the layers
-    that read the vehicle's motion, and of the depth network. (The published encoder asks for zeros in the second,
-    but of a `Sequential`, which has no bias of its own.)
+    that read the vehicle's motion, and of the depth network. The published encoder means those of the motion's layers
+    to be zero, but asks it of a `Sequential`, which has no bias of its own.
     """
     params: dict[str, Any] = flatten_dict(variables["params"], sep="/")
     for name, leaf in params.items():

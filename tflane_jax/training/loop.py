@@ -217,7 +217,7 @@ def train(
         states = [place(state) for state in states]
         first = step = int(states[0].step)
 
-        drawn = from_first(lambda: draw is not None)
+        drawn = from_first(lambda: draw is not None)  # the first process draws, from what all gather
 
         def begin() -> None:
             print_notices(add_provenance(folder, **started_from))

@@ -138,7 +138,7 @@ def test_the_legend_of_camera_images_names_what_is_drawn():
     above = [entry.get_label() for entry in above_entries(fake_segments(), with_segments())]
     assert above == ["truth, in predictions", "predicted lane (fainter: unsure)", "predicted topology"]
     truth = [entry.get_label() for entry in above_entries(None, with_segments())]
-    assert truth == ["ground out of sight", "lane in sight", "in part", "lane out of sight"]
+    assert truth == ["ground out of sight", "lane in sight", "lane partly in sight", "lane out of sight"]
 
 
 def test_pages_show_segments(tmp_path):

@@ -18,10 +18,11 @@ def visibility_entries() -> list:
     from matplotlib.colors import to_rgb
     from matplotlib.lines import Line2D
 
-    between = [sum(ends) / 2 for ends in zip(to_rgb(style.LANE_CLEAR), to_rgb(style.LANE_HIDDEN), strict=True)]
+    (r, g, b), (to_r, to_g, to_b) = to_rgb(style.LANE_CLEAR), to_rgb(style.LANE_HIDDEN)
+    between = (r + to_r) / 2, (g + to_g) / 2, (b + to_b) / 2
     return [
         Line2D([], [], color=style.LANE_CLEAR, lw=2, label="lane in sight"),
-        Line2D([], [], color=between, lw=2, label="in part"),
+        Line2D([], [], color=between, lw=2, label="lane partly in sight"),
         Line2D([], [], color=style.LANE_HIDDEN, lw=2, label="lane out of sight"),
     ]
 

@@ -68,6 +68,6 @@ TABLES = (
         seeds=3,
         steps=2500,
         minutes=10.0,
-        search=RateSearch((_PUBLISHED,), (5e-4, 1.5e-3, 4.5e-3), "all/DET_l"),
+        search=RateSearch((_PUBLISHED,), (1.7e-4, 5e-4, 1.5e-3, 4.5e-3), "all/DET_l"),
     ),
 )

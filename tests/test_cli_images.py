@@ -11,6 +11,7 @@ from tests.shared import shared_path
 from tflane_jax.cli import main
 from tflane_jax.files.tusimple import read_predictions, read_truth
 from tflane_jax.metrics.tusimple import TuSimpleMetrics
+from tflane_jax.world.render.weather import Sky
 
 pytest.importorskip("cv2")
 
@@ -73,6 +74,9 @@ def test_evaluation_prints_a_table(trained, capsys):
     said = capsys.readouterr().out
     assert "TuSimple, time not measured" in said
     assert "| Accuracy |" in said.replace("  ", " ")
+    rows = [line.split("|")[1].strip() for line in said.splitlines() if line.startswith("|")]
+    assert "all" in rows
+    assert {kind.value for kind in Sky} & set(rows), f"a row for each kind of weather: {rows}"
     assert main(["eval", str(trained), "--max-instances", "3"]) == 2
     assert main(["eval", str(trained), "--data", "argoverse2", "--root", "x"]) == 2
     assert "are no images" in capsys.readouterr().err

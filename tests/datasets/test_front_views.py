@@ -13,7 +13,7 @@ from tflane_jax.datasets.front_views import FrontViewConfig, FrontViewDataset, l
 from tflane_jax.datasets.leaves import IMAGE_PARTS, example_leaves, image_from_leaves
 from tflane_jax.datasets.streaming import StreamingConfig
 from tflane_jax.errors import UserError
-from tflane_jax.world.front_view.views import FrontWorldConfig
+from tflane_jax.world.front_view.views import FrontWorldConfig, draw_front_scene
 
 SMALL = FrontViewConfig(split="val", images=3, first=5)
 
@@ -49,6 +49,15 @@ def test_an_image_depends_on_its_number_alone():
     assert_same(other.example(0), dataset.example(1))
     assert (len(dataset), dataset.name, dataset.config) == (3, "front-views-val", SMALL)
     assert dataset.info(1).scene == other.info(0).scene == "front-100000006"
+
+
+def test_the_weather_of_an_image_is_that_of_its_scene():
+    dataset = FrontViewDataset(FrontViewConfig("test", 30, world=FrontWorldConfig(severity=1.0)))
+    drawn = [draw_front_scene(dataset.scene_id(index), dataset.config.world).weather.kind for index in range(30)]
+    assert [dataset.weather(index) for index in range(30)] == [kind.value for kind in drawn]
+    assert len(set(drawn)) > 3
+    clear = FrontViewDataset(FrontViewConfig("test", 9, world=FrontWorldConfig(severity=0.0)))
+    assert {clear.weather(index) for index in range(9)} == {"clear"}
 
 
 def test_an_example_is_a_whole_road_image():

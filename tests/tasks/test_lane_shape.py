@@ -12,7 +12,10 @@ from tests.models.images import HEIGHT, WIDTH, road_image, road_images, tiny_mod
 from tests.parameters import random_params
 from tests.slow import with_slow
 from tflane_jax.config import FrontViewData
+from tflane_jax.datasets.lane_rows import LabelledImages
 from tflane_jax.errors import UserError
+from tflane_jax.evaluation.results import EvaluationConfig
+from tflane_jax.files.tusimple import RowLanes
 from tflane_jax.layers.batch_norm import STATISTICS
 from tflane_jax.losses.lane_shape import LaneShapeLossConfig
 from tflane_jax.models.graph_encoders import GcnEncoderConfig, GtnEncoderConfig, HanEncoderConfig
@@ -239,6 +242,28 @@ def test_the_validation_loss_does_not_depend_on_the_batch_size():
     for i in range(5):
         one = jax.tree.map(lambda leaf, i=i: leaf[i : i + 1], (answer.curves, lines))
         np.testing.assert_allclose(lane_shape._losses(task, *one)[0], together[i], rtol=1e-5)
+
+
+def test_groups_of_images_are_measured_like_all_images(monkeypatch):
+    """An oracle of the first lane of every image: the scores of a group are those of its images alone."""
+    images, task, rows = road_images(4), tiny_task(), np.arange(160.0, 720.0, 10.0)
+    truth = [RowLanes(np.arange(1.0, i + 2)[:, None] * 100.0 + 0.1 * rows, rows) for i in range(4)]
+    found = [RowLanes(lanes.x[:1], rows) for lanes in truth]
+    by_truth = dict(zip(map(id, truth), found, strict=True))
+    monkeypatch.setattr(lane_shape, "found_lanes", lambda prediction, lanes: by_truth[id(lanes)])
+    params, config = fit("transformer").params, EvaluationConfig(batch_size=3)
+    weather = ("rain", "clear", "clear", "rain")
+
+    def evaluated(which, **groups):
+        chosen = jax.tree.map(lambda leaf: leaf[np.array(which)], images)
+        return task.evaluate(params, LabelledImages(chosen, [truth[i] for i in which]), config, **groups).groups
+
+    every = evaluated(range(4), frame_groups=weather)
+    assert list(every) == ["all", "clear", "rain"]
+    for group, which in (("clear", [1, 2]), ("rain", [0, 3])):
+        alone = evaluated(which)["all"]
+        assert every[group] == {name: alone[name] for name in ("frames", "Accuracy", "FP", "FN")}
+    assert evaluated(range(4)) == {"all": every["all"]}
 
 
 def test_a_loss_of_one_image_is_refused():

@@ -17,6 +17,7 @@ from tflane_jax.commands.sources import (
     with_chosen_traffic,
 )
 from tflane_jax.config_io import to_json
+from tflane_jax.datasets.front_views import FrontViewConfig, FrontViewDataset
 from tflane_jax.datasets.overlap import Nearness
 from tflane_jax.datasets.sources import open_dataset
 from tflane_jax.errors import UserError
@@ -51,7 +52,7 @@ def run(options: argparse.Namespace) -> int:
         raise UserError("--errors needs a model that predicts centerlines or lane segments")
     source = source_for(trained, options)
     near = _nearness(trained, source, options.training_root)
-    groups = [] if near is None else near.groups
+    groups = _weather(source) if near is None else near.groups
     task = limited_task(trained, options)
     protocol, rows = evaluate_run(trained, source, task=task, frame_groups=groups)
 
@@ -116,6 +117,14 @@ def _save_edge_types(run: Run, source: Any, stem: Path) -> list[Path]:
     examples = stack_examples([dataset.example(index) for index in spread(len(dataset), _IMAGES)])
     models = {f"seed {seed}": Model(task, params) for seed, params in zip(seeds, run.params, strict=True)}
     return save_edge_types(models, examples, stem.with_name(f"{stem.name}-edge_types"))
+
+
+def _weather(source: Any) -> list[str]:
+    """Return the weather of each image of the built-in world's front views; other data do not name theirs."""
+    if not isinstance(source, FrontViewConfig):
+        return []
+    dataset = FrontViewDataset(source)
+    return [dataset.weather(index) for index in range(len(dataset))]
 
 
 def _nearness(run: Run, source: Any, root: Path | None) -> Nearness | None:

@@ -25,7 +25,7 @@ from tflane_jax.files.tusimple import RowLanes
 from tflane_jax.limits import Count
 from tflane_jax.scene import LaneLines, RoadImage
 from tflane_jax.world.front_view.lines import CAPACITY, ROW_FRACTIONS
-from tflane_jax.world.front_view.views import FrontWorldConfig, front_view
+from tflane_jax.world.front_view.views import FrontWorldConfig, front_view, scene_weather
 
 
 @dataclass(frozen=True)
@@ -76,6 +76,10 @@ class FrontViewDataset:
     def info(self, index: int) -> FrameInfo:
         """Return where one image comes from; a front view has no time and no pose."""
         return FrameInfo("front-views", f"front-{self.scene_id(index):09d}", 0, np.eye(4))
+
+    def weather(self, index: int) -> str:
+        """Return the kind of weather of one image, such as "low sun" (see `world.render.weather.Sky`)."""
+        return scene_weather(self.scene_id(index), self.config.world).kind.value
 
     def scene_id(self, index: int) -> int:
         """Return the world's number of one image; raises IndexError outside the dataset."""

@@ -77,7 +77,7 @@ class LaneShapeTask(Task[RoadImage, LabelledImages, ImageSource, None]):
     model: LstrConfig = LstrConfig()
     losses: LaneShapeLossConfig = LaneShapeLossConfig()
 
-    columns: ClassVar[tuple[str, ...]] = ("seed", "Accuracy", "FP", "FN", "loss", "frames")
+    columns: ClassVar[tuple[str, ...]] = ("lanes of", "seed", "Accuracy", "FP", "FN", "loss", "frames")
     compared: ClassVar[tuple[str, ...]] = ("all/Accuracy", "all/FP", "all/FN")
     errors: ClassVar[tuple[str, ...]] = ("all/FP", "all/FN")
 
@@ -165,8 +165,9 @@ class LaneShapeTask(Task[RoadImage, LabelledImages, ImageSource, None]):
     def evaluate(
         self, params: Params, data: LabelledImages, config: EvaluationConfig, frame_groups: Sequence[str] = ()
     ) -> Evaluation:
-        """Return TuSimple's metrics, and the loss of the last decoder layer, its mean over images; without groups."""
+        """Return TuSimple's metrics, and the loss of the last decoder layer, its mean over images."""
         metrics, losses = TuSimpleMetrics(), []
+        of_group = {group: TuSimpleMetrics() for group in sorted(set(frame_groups))}
         predicted = predicted_batches(
             self, params, data.images, config.batch_size, lambda b: b.replace(image=None), what=FOR_SCORES
         )
@@ -175,10 +176,14 @@ class LaneShapeTask(Task[RoadImage, LabelledImages, ImageSource, None]):
             losses += np.asarray(_losses(self, answer.curves, lines)).tolist()
             for row, index in enumerate(indices):
                 truth, found = data.truth[index], jax.tree.map(lambda leaf, i=row: leaf[i], answer.curves)
-                metrics.update(found_lanes(found, truth), truth)
+                lanes = found_lanes(found, truth)
+                metrics.update(lanes, truth)
+                if of_group:
+                    of_group[frame_groups[index]].update(lanes, truth)
         # An image is a scene: in the built-in world each shows another road, of TuSimple's clips one image is labelled.
         ratios = {f"all/{name}": summed_ratio(parts, np.arange(len(parts))) for name, parts in metrics.means().items()}
         groups = {"all": metrics.compute() | {"loss": float(np.mean(losses))}}
+        groups |= {group: part.compute() for group, part in of_group.items()}
         return Evaluation(metrics.protocol, groups, ratios=ratios)
 
     def score_names(self, data: SplitData, config: EvaluationConfig) -> set[str]:

@@ -78,9 +78,7 @@ def draw_front_scene(scene_id: int, config: FrontWorldConfig = FrontWorldConfig(
 
     Raises UserError if the severity is not between 0 and 1.
     """
-    if not 0.0 <= config.severity <= 1.0:
-        raise UserError(f"severity must be between 0 and 1, not {config.severity}")
-    weather = draw_weather(_stream(scene_id, Stream.WEATHER), config.weather, config.severity)
+    weather = scene_weather(scene_id, config)
     road = draw_highway(_stream(scene_id, Stream.ROAD), config.road, weather.wear)
     return FrontScene(
         camera=draw_camera(_stream(scene_id, Stream.CAMERA), config.camera),
@@ -89,6 +87,13 @@ def draw_front_scene(scene_id: int, config: FrontWorldConfig = FrontWorldConfig(
         roadside=draw_roadside(_stream(scene_id, Stream.ROADSIDE), road),
         weather=weather,
     )
+
+
+def scene_weather(scene_id: int, config: FrontWorldConfig = FrontWorldConfig()) -> Weather:
+    """Return light and weather of the scene with this number; raise UserError like `draw_front_scene`."""
+    if not 0.0 <= config.severity <= 1.0:
+        raise UserError(f"severity must be between 0 and 1, not {config.severity}")
+    return draw_weather(_stream(scene_id, Stream.WEATHER), config.weather, config.severity)
 
 
 def front_view(scene_id: int, config: FrontWorldConfig = FrontWorldConfig()) -> RoadImage:

@@ -7,6 +7,8 @@ import pytest
 
 from tests.ablations.test_tables import small
 from tests.tiny_run import fakes  # noqa: F401 (a fixture that is used by itself)
+from tflane_jax.ablations import workers
+from tflane_jax.ablations.reuse import FILE, find_archives
 from tflane_jax.ablations.table_plan import plan_table
 from tflane_jax.ablations.table_run import run_table
 from tflane_jax.cli import main
@@ -98,3 +100,29 @@ def test_no_run_is_an_error(tiny, tmp_path):
 def test_options_that_train_are_refused(option, capsys):
     assert main(["tables", "gtn_lane.1", "--finished", option]) == 2
     assert "leave out --" in capsys.readouterr().err
+
+
+def test_a_machine_that_goes_leaves_the_record_of_its_finished_runs(tiny, tmp_path, monkeypatch, capsys):
+    """The third training never returns. Of all that was written, one file of the table is left."""
+    here, elsewhere = tmp_path / "here", tmp_path / "elsewhere"
+    train_run, begun = workers.train_run, []
+
+    def gone(config, folder, **options):
+        begun.append(folder)
+        if len(begun) == 3:
+            raise KeyboardInterrupt
+        return train_run(config, folder, **options)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(workers, "train_run", gone)
+        with pytest.raises(KeyboardInterrupt):
+            run_table(small(tiny), range(2), here)
+    (elsewhere / "paper.9").mkdir(parents=True)
+    shutil.copy(here / "paper.9" / FILE, elsewhere / "paper.9")
+    shutil.rmtree(here)
+    archive = find_archives(elsewhere, ["paper.9"])["paper.9"]
+    assert set(archive.runs) == {folder.name for folder in begun[:2]}
+    planned = plan_table(small(tiny), range(2), tmp_path / "new", archive=archive).every()
+    assert {job.folder.name for job in planned if job.is_complete()} == set(archive.runs)
+    run_table(small(tiny), range(2), tmp_path / "new", archive=archive, finished=True)
+    assert "2 of 3 runs are finished; not yet: again, seed 0\n" in capsys.readouterr().out

@@ -15,11 +15,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from tflane_jax.ablations.archive import Archive, read_archive
+from tflane_jax.ablations.archive import Archive, read_archive, write_archive
 from tflane_jax.ablations.facts import facts
 from tflane_jax.ablations.jobs import Job
 from tflane_jax.ablations.recorded import Measured, RecordedRun, evaluation_name
-from tflane_jax.ablations.scores import evaluations, measure
+from tflane_jax.ablations.scores import evaluations, is_measured, measure
 from tflane_jax.config_io import first_difference, to_json
 from tflane_jax.errors import UserError
 from tflane_jax.runs import current_form
@@ -38,16 +38,18 @@ def archive_path(folder: Path, table: str) -> Path:
 
 
 def find_archives(folder: Path, tables: Collection[str]) -> dict[str, Archive]:
-    """Return the record of each table in a folder of results; an empty one, with a message, if it has none.
+    """Return the record of each table in a folder of results or of tables; an empty one, with a message, for none.
 
     Raises UserError if there is no such folder, or a record in it is damaged or of another table.
     """
     if not folder.is_dir():
-        raise UserError(f"--from {folder} is no folder: give the folder of results, such as docs/results")
+        raise UserError(
+            f"--from {folder} is no folder: give that of results, such as docs/results, or of tables (--out)"
+        )
     every: dict[str, Archive] = {}
-    for path in sorted((folder / _FOLDER).glob(f"*{_SUFFIX}")):
+    for path in (*sorted(folder.glob(f"*/{FILE}")), *sorted((folder / _FOLDER).glob(f"*{_SUFFIX}"))):
         archive = read_archive(path)
-        if path != archive_path(folder, archive.table):
+        if path not in (archive_path(folder, archive.table), folder / archive.table / FILE):
             raise UserError(f"{path} is the record of {archive.table}")
         every[archive.table] = archive
     runs = {key: run for archive in every.values() for key, run in archive.runs.items()}
@@ -179,6 +181,45 @@ def archive_of(
                 kept = None if job.recorded is None else replace(job.recorded, row=name)
                 runs[key] = kept or _recorded(key, name, job, scores, curves, now)
     return Archive(table, declaration, runs)
+
+
+class InterimRecord:
+    """The record of a table while it is trained: its file is written anew after each run.
+
+    Whatever ends the machine, the small file holds all runs that had finished, with their scores. Another machine
+    takes them by `--from`.
+
+    Args:
+        path: of the file.
+        table, declaration, scores, curves: see `archive_of`.
+        plan: trainings of each row; those that are complete and measured enter at once.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        table: str,
+        declaration: Mapping[str, Any],
+        plan: Plan,
+        scores: Collection[str],
+        curves: Collection[str],
+    ) -> None:
+        self._path, self._table, self._declaration = path, table, declaration
+        self._kept = scores, curves
+        self._rows = {job.folder: name for name, jobs in reversed([*plan.items()]) for job in jobs}
+        known = {name: [job for job in jobs if is_measured(job)] for name, jobs in plan.items()}
+        self._runs = archive_of(table, declaration, known, scores, curves).runs
+
+    def add(self, job: Job) -> None:
+        """Add a finished run, unless it is a host, which is in no row.
+
+        Raises OSError or UserError if the file cannot be written.
+        """
+        if (row := self._rows.get(job.folder)) is None:
+            return
+        (run,) = archive_of(self._table, self._declaration, {row: [job]}, *self._kept).runs.values()
+        self._runs = {**self._runs, run.key: run}
+        write_archive(self._path, Archive(self._table, self._declaration, self._runs))
 
 
 def _recorded(key: str, row: str, job: Job, scores: Collection[str], curves: Collection[str], now: str) -> RecordedRun:

@@ -6,7 +6,8 @@
 <out>/TABLE/effects.md, .json     the claims: shown, not shown, or contradicted
 <out>/TABLE/curves.png            validation over training, mean and range over seeds
 <out>/TABLE/comparison.png        test frames in which the first claim's rows differ
-<out>/TABLE/scores.json.gz        the record of the runs' scores, from which the table can be made without them
+<out>/TABLE/scores.json.gz        the record of the runs' scores, written anew after each of them: the table can be made
+                                  from it, as `--from <out>` does, without the runs
 <out>/TABLE/summary.json          what docs/results.md is made of
 """
 
@@ -39,7 +40,7 @@ from tflane_jax.ablations.finished_runs import (
 from tflane_jax.ablations.jobs import Failure, Job, ScoredBy
 from tflane_jax.ablations.paper.table import PaperTable
 from tflane_jax.ablations.results import Results
-from tflane_jax.ablations.reuse import FILE, archive_of, unused
+from tflane_jax.ablations.reuse import FILE, InterimRecord, archive_of, unused
 from tflane_jax.ablations.scores import CHECKPOINTS, OWN_TEST, code_digest, evaluations, measure
 from tflane_jax.ablations.store import TOPOLOGY
 from tflane_jax.ablations.table_plan import plan_table, seed_by_seed, store_of, tell_unfinished, tell_work
@@ -115,7 +116,10 @@ def run_table(
         trained, failures = evaluate_others(plan, waiting, results)
     else:
         tell_work(planned, seeds, store_of(out, quick=quick), jobs, quick=quick)
-        trained, failures = train_and_evaluate(plan, seed_by_seed(planned.named()), results, jobs, cores)
+        content, tested_by = load_json(folder / DECLARATION), table.declaration.scores
+        interim = InterimRecord(folder / FILE, table.name, content, plan, tested_by, _curves(table))
+        order = seed_by_seed(planned.named())
+        trained, failures = train_and_evaluate(plan, order, results, jobs, cores, interim.add)
     _add_geometric(trained, results)
     save_plan(plan, failures, results, folder)
     if not results.scores:

@@ -12,7 +12,7 @@ import signal
 import sys
 import time
 import traceback
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 from tflane_jax import accelerators
@@ -35,20 +35,27 @@ from tflane_jax.training.runtime import configure_jax
 _POLL_SECONDS = 1.0
 
 
-def train_all(jobs: Sequence[Job], parallel: int, cores: int | None = None) -> list[Failure]:
+Finished = Callable[[Job], None]
+"""What is done with a run as soon as this process or one of its workers has finished it."""
+
+
+def train_all(
+    jobs: Sequence[Job], parallel: int, cores: int | None = None, finished: Finished | None = None
+) -> list[Failure]:
     """Train every job that is not complete, in this process or `parallel` at a time in workers; return what failed.
 
     Workers have `cores` cores each, or equal shares of all for None. With `cores`, one at a time is a worker too.
     Workers also measure runs that are complete, but not measured by this state of the code.
 
     Several processes, also of several machines that share a folder, may train the same jobs: each takes those that no
-    other has reserved, and returns when all are complete.
+    other has reserved, and returns when all are complete. `finished` is not called for those that others train; an
+    error that it raises is a failure of that run.
     """
     code_digest()  # of the code that is running: its files may change while it trains
     with Reservations() as reservations:
         if parallel == 1 and cores is None:
-            return _train_here(Queue(jobs, reservations, lambda job: job.is_complete()))
-        return _train_in_workers(Queue(jobs, reservations, is_measured), jobs, parallel, cores)
+            return _train_here(Queue(jobs, reservations, lambda job: job.is_complete()), finished)
+        return _train_in_workers(Queue(jobs, reservations, is_measured), jobs, parallel, cores, finished)
 
 
 def worker_threads(parallel: int, cores: int | None = None) -> dict[str, Any]:
@@ -88,7 +95,7 @@ def _log(job: Job, text: str) -> None:
         write(f"cannot write {job.log} ({error.strerror}):\n{text}")
 
 
-def _train_here(queue: Queue) -> list[Failure]:
+def _train_here(queue: Queue, finished: Finished | None) -> list[Failure]:
     failures: list[Failure] = []
     waits = False
     while len(queue):
@@ -103,12 +110,16 @@ def _train_here(queue: Queue) -> list[Failure]:
             write(f"train {job.label or job.folder}")
             if (number := train_run(job.config, job.folder, start=job.start(), drawn="end").asked_by) is not None:
                 raise Interrupted(number)  # all of it; the same command resumes what was written
+            if finished is not None:
+                finished(job)
         queue.done(job)
         _tell([failure for failure in failures if failure.job is job])
     return failures
 
 
-def _train_in_workers(queue: Queue, jobs: Sequence[Job], parallel: int, cores: int | None) -> list[Failure]:
+def _train_in_workers(
+    queue: Queue, jobs: Sequence[Job], parallel: int, cores: int | None, finished: Finished | None
+) -> list[Failure]:
     failures: list[Failure] = []
     built: set[Any] = set()
     with contextlib.ExitStack() as stack:
@@ -139,6 +150,9 @@ def _train_in_workers(queue: Queue, jobs: Sequence[Job], parallel: int, cores: i
                     failures.append(failure)
                     _tell([failure])
                 if job is not None and worker.job is None:
+                    if failure is None and finished is not None:
+                        with noted(job, failures):
+                            finished(job)
                     queue.done(job)
     return failures
 

@@ -128,7 +128,7 @@ def tables(commands) -> None:
         dest="source",
         metavar="DIR",
         type=Path,
-        help="take the runs that are recorded in DIR instead of training them, such as docs/results",
+        help="take the runs that are recorded in DIR (docs/results, or an earlier --out) instead of training them",
     )
     parser.add_argument(
         "--finished",

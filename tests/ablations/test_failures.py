@@ -3,6 +3,7 @@
 import json
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 
@@ -263,13 +264,16 @@ def test_a_table_that_fails_does_not_stop_the_others(tmp_path, monkeypatch, caps
     """Regression: a training that diverges does so each time, and later tables of a command were never reached."""
     reached, recorded = [], []
 
-    def failing_first(table, seeds, out, **options):
-        reached.append(table.name)
+    def failing_first(begun, failures):
+        reached.append(begun.table.name)
         if len(reached) == 1:
             raise UserError("1 of 40 trainings failed")
-        return out / table.name / "table.md"
+        return tmp_path / begun.table.name / "table.md"
 
-    monkeypatch.setattr("tflane_jax.ablations.table_run.run_table", failing_first)
+    run = "tflane_jax.ablations.table_run"
+    monkeypatch.setattr(f"{run}.begin_table", lambda table, *_, **__: SimpleNamespace(table=table))
+    monkeypatch.setattr(f"{run}.train_tables", lambda *_: [])
+    monkeypatch.setattr(f"{run}.finish_table", failing_first)
     monkeypatch.setattr("tflane_jax.ablations.table_plan.plan_table", lambda *_, **__: None)
     monkeypatch.setattr("tflane_jax.commands.tables.record", lambda paths, folder: recorded.append(paths) or folder)
     command = ["tables", "tf_lane.1", "tf_lane.2", "--out", str(tmp_path), "--record", str(tmp_path / "results")]

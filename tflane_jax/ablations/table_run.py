@@ -17,7 +17,7 @@ import importlib.util
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +35,6 @@ from tflane_jax.ablations.finished_runs import (
     first_models,
     save_plan,
     summary_of,
-    train_and_evaluate,
 )
 from tflane_jax.ablations.jobs import Failure, Job, ScoredBy
 from tflane_jax.ablations.paper.table import PaperTable
@@ -43,7 +42,8 @@ from tflane_jax.ablations.results import Results
 from tflane_jax.ablations.reuse import FILE, InterimRecord, archive_of, unused
 from tflane_jax.ablations.scores import CHECKPOINTS, OWN_TEST, code_digest, evaluations, measure
 from tflane_jax.ablations.store import TOPOLOGY
-from tflane_jax.ablations.table_plan import plan_table, seed_by_seed, store_of, tell_unfinished, tell_work
+from tflane_jax.ablations.table_plan import TablePlan, plan_table, seed_by_seed, store_of, tell_unfinished, tell_work
+from tflane_jax.ablations.workers import train_all
 from tflane_jax.datasets.sources import source_of
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import write_json, write_text
@@ -53,6 +53,32 @@ from tflane_jax.progress import progress_bar
 
 GEOMETRIC = ", geometric"
 """Suffix of a topology score's name: with the score of `evaluation.geometric_topology` added to the learned one."""
+
+
+@dataclass(frozen=True)
+class TableRun:
+    """A table that is planned and declared, whose runs are to be trained and evaluated.
+
+    Attributes:
+        table: of the paper.
+        planned: its trainings.
+        seeds: of these trainings.
+        folder: of the table.
+        declared: what is tested.
+        interim: record of the runs that are finished; None with `finished`.
+        began: when, seconds of the monotonic clock.
+        quick, finished: see `run_table`.
+    """
+
+    table: PaperTable
+    planned: TablePlan
+    seeds: tuple[int, ...]
+    folder: Path
+    declared: Declared
+    interim: InterimRecord | None
+    began: float
+    quick: bool
+    finished: bool
 
 
 def run_table(
@@ -90,13 +116,33 @@ def run_table(
     Raises:
         UserError: trainings failed, after the files of the others were written; with `finished`, no run is.
     """
-    began, folder = time.monotonic(), store_of(out, quick=quick).parent / table.name
+    how: dict[str, Any] = {"quick": quick, "finished": finished, "archive": archive, "scored_by": scored_by}
+    run = begin_table(table, seeds, out, jobs=jobs, cores=cores, **how)
+    return finish_table(run, train_tables([run], jobs, cores))
+
+
+def begin_table(
+    table: PaperTable,
+    seeds: Sequence[int],
+    out: Path,
+    *,
+    jobs: int = 1,
+    cores: int | None = None,
+    quick: bool = False,
+    finished: bool = False,
+    archive: Archive | None = None,
+    scored_by: ScoredBy = "this code",
+) -> TableRun:
+    """Plan the trainings of a table, declare what is tested, and print what there is to do.
+
+    The arguments are those of `run_table`. Raises UserError for a table that must fail.
+    """
+    began, folder, interim = time.monotonic(), store_of(out, quick=quick).parent / table.name, None
     how: dict[str, Any] = {"quick": quick, "finished": finished, "archive": archive, "scored_by": scored_by}
     planned = plan_table(table, seeds, out, jobs=jobs, cores=cores, **how)
-    configs, plan = planned.rows, planned.jobs
+    plan = planned.jobs
     # Fewer seeds than the table has are an interim look at it.
     every = range(max(len(seeds), 0 if quick else table.seeds))
-    seeds = planned.seeds()
     if archive is not None:
         _adopt_declaration(
             archive, folder, lambda trial: declare(table.declaration, plan, planned.declared(), every, trial)
@@ -110,16 +156,49 @@ def run_table(
             raise
         (folder / DECLARATION).unlink()  # that of an earlier smoke test, which was no result
         declared = declare(table.declaration, plan, planned.declared(), every, folder)
-    results, waiting = Results(tuple(configs), tuple(seeds), {}), []
-    if finished:
-        waiting = [Failure(job, "not finished") for job in tell_unfinished(planned)]
-        trained, failures = evaluate_others(plan, waiting, results)
-    else:
-        tell_work(planned, seeds, store_of(out, quick=quick), jobs, quick=quick)
-        content, tested_by = load_json(folder / DECLARATION), table.declaration.scores
-        interim = InterimRecord(folder / FILE, table.name, content, plan, tested_by, _curves(table))
-        order = seed_by_seed(planned.named())
-        trained, failures = train_and_evaluate(plan, order, results, jobs, cores, interim.add)
+    if not finished:
+        tell_work(planned, planned.seeds(), store_of(out, quick=quick), jobs, quick=quick)
+        content, tested = load_json(folder / DECLARATION), table.declaration.scores
+        interim = InterimRecord(folder / FILE, table.name, content, plan, tested, _curves(table))
+    return TableRun(table, planned, tuple(planned.seeds()), folder, declared, interim, began, quick, finished)
+
+
+def train_tables(runs: Sequence[TableRun], jobs: int = 1, cores: int | None = None) -> list[Failure]:
+    """Train what is missing of some tables together, so that no worker waits for another table; return what failed.
+
+    Args:
+        runs: the tables; of those that are `finished`, nothing is trained.
+        jobs, cores: see `run_table`.
+    """
+    records = [run.interim for run in runs if run.interim is not None]
+    plans = {run.table.name: run.planned.named() for run in runs if not run.finished}
+    every = {f"{table}: {row}": of_row for table, plan in plans.items() for row, of_row in plan.items()}
+
+    def record(job: Job) -> None:
+        for one in records:
+            one.add(job)
+
+    return train_all(seed_by_seed(every), jobs, cores, record) if every else []
+
+
+def finish_table(run: TableRun, failures: Sequence[Failure]) -> Path:
+    """Evaluate the runs of a table, test the claims, and write the table's folder.
+
+    Args:
+        run: the table.
+        failures: trainings that failed, also those of other tables.
+
+    Returns:
+        The file of the table.
+
+    Raises UserError like `run_table`.
+    """
+    table, planned, folder, quick = run.table, run.planned, run.folder, run.quick
+    configs, plan = planned.rows, planned.jobs
+    results, own = Results(tuple(configs), run.seeds, {}), {job.folder for job in planned.every()}
+    waiting = [Failure(job, "not finished") for job in tell_unfinished(planned)] if run.finished else []
+    told = waiting or [failure for failure in failures if failure.job.folder in own]
+    trained, failures = evaluate_others(plan, told, results)
     _add_geometric(trained, results)
     save_plan(plan, failures, results, folder)
     if not results.scores:
@@ -128,16 +207,16 @@ def run_table(
     write_archive(folder / FILE, scores)
     first = next(iter(configs.values()))
     path = _save_scores(table, results, folder, quick=quick)
-    tested = judged_claims(results, declared.declaration, OWN_TEST, first.task.errors)
+    tested = judged_claims(results, run.declared.declaration, OWN_TEST, first.task.errors)
     no_drives = source_of(first.data.source("test")).no_drives
-    save_effects(results, declared, OWN_TEST, tested, folder / "effects", no_drives=no_drives)
+    save_effects(results, run.declared, OWN_TEST, tested, folder / "effects", no_drives=no_drives)
     pair = (table.claims[0].control or table.rows[0].name, table.claims[0].treatment)
     models = first_models(trained, results)
     if {results.owners.get(row, row) for row in pair} <= models.keys():  # recorded runs have no parameters
         draw_models(first, models, pair, folder / "comparison.png")
     _draw_curves(table, trained, folder / "curves.png")
-    _save_summary(table, declared, results, trained, tested, folder, quick=quick)
-    print(f"\n{table.name}: {folder} has tables, tests, curves and pictures ({time.monotonic() - began:.0f} s)")
+    _save_summary(table, run.declared, results, trained, tested, folder, quick=quick)
+    print(f"\n{table.name}: {folder} has tables, tests, curves and pictures ({time.monotonic() - run.began:.0f} s)")
     if failed := failures[len(waiting) :]:
         raise UserError(summary_of(failed, len(planned.every())))
     return path

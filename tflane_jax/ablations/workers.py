@@ -111,6 +111,7 @@ def _train_here(queue: Queue, finished: Finished | None) -> list[Failure]:
             if (number := train_run(job.config, job.folder, start=job.start(), drawn="end").asked_by) is not None:
                 raise Interrupted(number)  # all of it; the same command resumes what was written
             if finished is not None:
+                write(f"evaluate {job.label or job.folder}")
                 finished(job)
         queue.done(job)
         _tell([failure for failure in failures if failure.job is job])

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +26,8 @@ from tflane_jax.training.runtime import configure_jax
 def run(options: argparse.Namespace) -> int:
     """Run the named tables, or list all; without names, --record writes the page of results anew.
 
-    A table that fails does not stop the others; those that are complete are recorded.
+    A table that fails does not stop the others; those that are complete are recorded. Each is written before the next
+    one begins; with --together, all are trained first.
     """
     _check_together(options)
     if options.steps_factor < 1:
@@ -67,7 +70,7 @@ def run(options: argparse.Namespace) -> int:
         return 0
     from tflane_jax.ablations.reuse import find_archives
     from tflane_jax.ablations.table_plan import plan_table
-    from tflane_jax.ablations.table_run import run_table
+    from tflane_jax.ablations.table_run import begin_table, finish_table, train_tables
 
     how: dict[str, Any] = {"jobs": jobs, "cores": options.cores, "quick": options.quick, "finished": options.finished}
     how["scored_by"] = "any code" if options.earlier_scores else "this code"
@@ -76,19 +79,36 @@ def run(options: argparse.Namespace) -> int:
     if len(chosen) > 1:  # errors of the last one come before the first one is trained
         for table in chosen:
             plan_table(table, seeds[table.name], options.out, archive=archives.get(table.name), **how)
-    written, failed = [], []
-    for table in chosen:
-        try:
-            written.append(run_table(table, seeds[table.name], options.out, archive=archives.get(table.name), **how))
-        except UserError as error:
-            failed.append(f"{table.name}: {error}")
-            if table is not chosen[-1]:
-                write(f"{failed[-1]}\nthe other tables go on")
+    written: list[Path] = []
+    failed: list[str] = []
+    noted = partial(_noted, failed, several=len(chosen) > 1)
+    groups = [chosen] if options.together else [[table] for table in chosen]
+    for group in groups:
+        begun = []
+        for table in group:
+            with noted(table):
+                archive = archives.get(table.name)
+                begun.append(begin_table(table, seeds[table.name], options.out, archive=archive, **how))
+        failures = train_tables(begun, jobs, options.cores)
+        for each in begun:
+            with noted(each.table):
+                written.append(finish_table(each, failures))
     if options.record is not None and written:
         print("written:", record([path.with_name("summary.json") for path in written], options.record))
     if failed:
         raise UserError("\n".join(failed))
     return 0
+
+
+@contextlib.contextmanager
+def _noted(failed: list[str], table: PaperTable, *, several: bool) -> Iterator[None]:
+    """Add an error inside the block to those of the tables that failed; the others go on."""
+    try:
+        yield
+    except UserError as error:
+        failed.append(f"{table.name}: {error}")
+        if several:
+            write(f"{failed[-1]}\nthe other tables go on")
 
 
 def _convert(conversions: Sequence[Conversion]) -> None:
@@ -122,6 +142,7 @@ def _check_together(options: argparse.Namespace) -> None:
         "--record": options.record is not None,
         "--from": options.source is not None,
         "--earlier-scores": options.earlier_scores,
+        "--together": options.together,
         "--jobs": options.jobs is not None,
         "--cores": options.cores is not None,
         "--steps-factor": options.steps_factor != 1,
@@ -136,7 +157,7 @@ def _check_together(options: argparse.Namespace) -> None:
         raise UserError(f"--quick runs are no results and never recorded: leave out {idle[0]} or --quick")
     if options.finished and (idle := [name for name in names if name in ("--jobs", "--cores")]):
         raise UserError(f"--finished trains nothing: leave out {idle[0]}")
-    of_runs = ("--seeds", "--record", "--from", "--earlier-scores", "--finished")
+    of_runs = ("--seeds", "--record", "--from", "--earlier-scores", "--finished", "--together")
     if options.search and (idle := [name for name in names if name in of_runs]):
         raise UserError(f"--search trains other runs than the table's, with its own seeds: leave out {idle[0]}")
 

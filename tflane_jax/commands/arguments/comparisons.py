@@ -131,6 +131,11 @@ def tables(commands) -> None:
         help="take the runs that are recorded in DIR (docs/results, or an earlier --out) instead of training them",
     )
     parser.add_argument(
+        "--together",
+        action="store_true",
+        help="train the runs of all named tables, seed by seed, before any table is written: no worker waits for one",
+    )
+    parser.add_argument(
         "--finished",
         action="store_true",
         help="train nothing: make the table of the runs that are complete, whatever cores or GPU trained them",

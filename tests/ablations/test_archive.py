@@ -248,12 +248,16 @@ def test_the_command_takes_recorded_runs(tiny, made, tmp_path, monkeypatch, caps
     assert main([*arguments, str(made.with_name("results"))]) == 0
     assert "(6 of them recorded)" in capsys.readouterr().out
     for more, message in (
-        ([str(tmp_path / "none")], "none is no folder: give the folder of results"),
+        (
+            [str(tmp_path / "none")],
+            "none is no folder: give that of results, such as docs/results, or of tables (--out)",
+        ),
         ([str(made), "--quick"], "--quick runs are no results and never recorded"),
     ):
         assert main([*arguments, *more]) == 2
         assert message in capsys.readouterr().err
-    recorded(made)
+    assert recorded(made).runs == recorded(made.with_name("results")).runs  # of the tables' own folder
+    recorded(made / "runs")
     assert "no run of paper.9 is recorded there" in capsys.readouterr().out
     shutil.copy(made.with_name("results") / "scores" / "paper.9.json.gz", tmp_path / "paper.10.json.gz")
     (tmp_path / "scores").mkdir()

@@ -170,39 +170,6 @@ def test_the_page_tells_which_rows_made_how_many_updates(tmp_path):
         assert sentence in page(tmp_path).replace("\n", " ")
 
 
-def test_all_tables_are_checked_before_the_first_is_trained(tiny, tmp_path, monkeypatch, capsys):
-    wrong = TableRow("tfm", str(tiny), ("--training.best_metric", "all/NONE"))
-    tables = {"paper.9": small(tiny), "paper.10": small(tiny, name="paper.10", rows=(*small(tiny).rows[:1], wrong))}
-    monkeypatch.setattr("tflane_jax.commands.tables.find_table", tables.get)
-    assert main(["tables", *tables, "--seeds", "1", "--out", str(tmp_path / "out")]) == 2
-    assert re.search(r"tfm: .*training\.best_metric", capsys.readouterr().err)
-    assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize("together", [False, True])
-def test_tables_of_one_command_are_trained_one_by_one_or_together(tiny, tmp_path, monkeypatch, together):
-    """The second table adds one row to two of the first. Together they advance seed by seed."""
-    other = TableRow("slow", str(tiny), ("--optim.lr", "0.001"))
-    rows = (*small(tiny).rows[:2], other)
-    tables = {"paper.9": small(tiny), "paper.10": small(tiny, name="paper.10", rows=rows)}
-    trained, train_run = [], workers.train_run
-
-    def noting(config, folder, **options):
-        trained.append((config.training.seeds[0], config.optim.lr))
-        return train_run(config, folder, **options)
-
-    monkeypatch.setattr("tflane_jax.commands.tables.find_table", tables.get)
-    monkeypatch.setattr(workers, "train_run", noting)
-    options = ["--together"] if together else []
-    assert main(["tables", *tables, *options, "--seeds", "2", "--out", str(tmp_path)]) == 0
-    seeds = [seed for seed, _ in trained]
-    assert len(trained) == 8  # two rows are trained once for both
-    assert seeds == ([0] * 4 + [1] * 4 if together else [0] * 3 + [1] * 3 + [0, 1])
-    for name in tables:
-        rates = json.loads((tmp_path / name / "summary.json").read_text())["rows"]
-        assert {row["seeds"] for row in rates} == {2}
-
-
 @pytest.mark.slow
 def test_a_table_that_was_stopped_ends_with_the_same_bytes(tiny, tmp_path, monkeypatch):
     whole, parts = tmp_path / "whole", tmp_path / "parts"

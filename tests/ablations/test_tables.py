@@ -69,6 +69,23 @@ def small(tiny, **changes):
     return PaperTable(**{**settings, **changes})
 
 
+def stopped_at_the_third(table, out, monkeypatch):
+    """Begin a table of two seeds, whose third training never returns; return the folders of all three."""
+    train_run, begun = workers.train_run, []
+
+    def stopped(config, folder, **options):
+        begun.append(folder)
+        if len(begun) == 3:
+            raise KeyboardInterrupt
+        return train_run(config, folder, **options)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(workers, "train_run", stopped)
+        with pytest.raises(KeyboardInterrupt):
+            run_table(table, range(2), out)
+    return begun
+
+
 def test_a_table_from_training_to_page(tiny, tmp_path, capsys):
     out = tmp_path / "out"
     path = run_table(small(tiny), range(2), out)
@@ -174,18 +191,7 @@ def test_the_page_tells_which_rows_made_how_many_updates(tmp_path):
 def test_a_table_that_was_stopped_ends_with_the_same_bytes(tiny, tmp_path, monkeypatch):
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     run_table(small(tiny), range(2), whole)
-    train_run, count = workers.train_run, []
-
-    def stopped(config, folder, **options):
-        count.append(folder)
-        if len(count) == 3:
-            raise KeyboardInterrupt
-        return train_run(config, folder, **options)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(workers, "train_run", stopped)
-        with pytest.raises(KeyboardInterrupt):
-            run_table(small(tiny), range(2), parts)
+    stopped_at_the_third(small(tiny), parts, monkeypatch)
     assert not list(parts.rglob("*.reserved"))
     run_table(small(tiny), range(2), parts)
     for name in ("table.md", "table.json", "table.tex"):

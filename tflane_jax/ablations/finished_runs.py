@@ -11,7 +11,7 @@ from tflane_jax.ablations.facts import facts
 from tflane_jax.ablations.jobs import Failure, Job
 from tflane_jax.ablations.results import Results
 from tflane_jax.ablations.scores import CHECKPOINTS, OWN_TEST, measure, with_test_set
-from tflane_jax.ablations.workers import Finished, noted, train_all
+from tflane_jax.ablations.workers import noted, train_all
 from tflane_jax.config import RunConfig
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import write_json
@@ -21,12 +21,7 @@ from tflane_jax.tasks import Model
 
 
 def train_and_evaluate(
-    plan: Mapping[str, Sequence[Job]],
-    order: Sequence[Job],
-    results: Results,
-    jobs: int,
-    cores: int | None = None,
-    finished: Finished | None = None,
+    plan: Mapping[str, Sequence[Job]], order: Sequence[Job], results: Results, jobs: int
 ) -> tuple[dict[str, list[Job]], list[Failure]]:
     """Train what is missing, and add the scores of all runs, and why models failed, to the results.
 
@@ -35,13 +30,11 @@ def train_and_evaluate(
         order: of these trainings, and of those that they start from.
         results: without scores; changed.
         jobs: trainings at a time.
-        cores: of each training; None shares all between the trainings.
-        finished: see `workers.train_all`.
 
     Returns:
         The runs that were trained and evaluated, and the failures of the others.
     """
-    return evaluate_others(plan, train_all(order, jobs, cores, finished), results)
+    return evaluate_others(plan, train_all(order, jobs), results)
 
 
 def evaluate_others(

@@ -206,6 +206,7 @@ class InterimRecord:
     ) -> None:
         self._path, self._table, self._declaration = path, table, declaration
         self._kept = scores, curves
+        # Of equal rows, the first names the run, as in `archive_of`.
         self._rows = {job.folder: name for name, jobs in reversed([*plan.items()]) for job in jobs}
         known = {name: [job for job in jobs if is_measured(job)] for name, jobs in plan.items()}
         self._runs = archive_of(table, declaration, known, scores, curves).runs

@@ -75,7 +75,7 @@ def plan_table(
     archive: Archive | None = None,
     scored_by: ScoredBy = "this code",
 ) -> TablePlan:
-    """Return the trainings of a table; the arguments are those of `table_run.run_table`.
+    """Return the trainings of a table; the arguments are those of `table_run.begin_table`.
 
     Raises UserError where one of them must fail; with `finished`, where none is complete.
     """

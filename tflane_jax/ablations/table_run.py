@@ -62,53 +62,29 @@ class TableRun:
     Attributes:
         table: of the paper.
         planned: its trainings.
-        seeds: of these trainings.
         folder: of the table.
         declared: what is tested.
-        interim: record of the runs that are finished; None with `finished`.
+        interim: record of the runs that are finished; None where nothing is trained.
         began: when, seconds of the monotonic clock.
-        quick, finished: see `run_table`.
+        quick: see `begin_table`.
     """
 
     table: PaperTable
     planned: TablePlan
-    seeds: tuple[int, ...]
     folder: Path
     declared: Declared
     interim: InterimRecord | None
     began: float
     quick: bool
-    finished: bool
 
 
 def run_table(
-    table: PaperTable,
-    seeds: Sequence[int],
-    out: Path,
-    *,
-    jobs: int = 1,
-    cores: int | None = None,
-    quick: bool = False,
-    finished: bool = False,
-    archive: Archive | None = None,
-    scored_by: ScoredBy = "this code",
+    table: PaperTable, seeds: Sequence[int], out: Path, *, jobs: int = 1, cores: int | None = None, **how: Any
 ) -> Path:
     """Train what is missing, evaluate, test the claims, and write the table's folder.
 
     The same command resumes a table that was stopped. Several processes, also of several machines that share the
-    folder, may run the same table.
-
-    Args:
-        table: of the paper.
-        seeds: of training.
-        out: folder of all tables and their runs.
-        jobs: trainings at a time.
-        cores: of each training; None shares all between the trainings.
-        quick: few updates on few data, below `<out>/quick`: a smoke test, no result.
-        finished: train nothing; the table is of the runs that are complete, with any number of cores and on any one
-            device.
-        archive: recorded runs, which are taken instead of trained; None for none.
-        scored_by: state of the code whose scores count where they are kept beside a run, see `Job`.
+    folder, may run the same table. The arguments are those of `begin_table`.
 
     Returns:
         The file of the table.
@@ -116,7 +92,6 @@ def run_table(
     Raises:
         UserError: trainings failed, after the files of the others were written; with `finished`, no run is.
     """
-    how: dict[str, Any] = {"quick": quick, "finished": finished, "archive": archive, "scored_by": scored_by}
     run = begin_table(table, seeds, out, jobs=jobs, cores=cores, **how)
     return finish_table(run, train_tables([run], jobs, cores))
 
@@ -135,7 +110,19 @@ def begin_table(
 ) -> TableRun:
     """Plan the trainings of a table, declare what is tested, and print what there is to do.
 
-    The arguments are those of `run_table`. Raises UserError for a table that must fail.
+    Args:
+        table: of the paper.
+        seeds: of training.
+        out: folder of all tables and their runs.
+        jobs: trainings at a time.
+        cores: of each training; None shares all between the trainings.
+        quick: few updates on few data, below `<out>/quick`: a smoke test, no result.
+        finished: train nothing; the table is of the runs that are complete, with any number of cores and on any one
+            device.
+        archive: recorded runs, which are taken instead of trained; None for none.
+        scored_by: state of the code whose scores count where they are kept beside a run, see `Job`.
+
+    Raises UserError for a table that must fail.
     """
     began, folder, interim = time.monotonic(), store_of(out, quick=quick).parent / table.name, None
     how: dict[str, Any] = {"quick": quick, "finished": finished, "archive": archive, "scored_by": scored_by}
@@ -160,18 +147,18 @@ def begin_table(
         tell_work(planned, planned.seeds(), store_of(out, quick=quick), jobs, quick=quick)
         content, tested = load_json(folder / DECLARATION), table.declaration.scores
         interim = InterimRecord(folder / FILE, table.name, content, plan, tested, _curves(table))
-    return TableRun(table, planned, tuple(planned.seeds()), folder, declared, interim, began, quick, finished)
+    return TableRun(table, planned, folder, declared, interim, began, quick)
 
 
 def train_tables(runs: Sequence[TableRun], jobs: int = 1, cores: int | None = None) -> list[Failure]:
     """Train what is missing of some tables together, so that no worker waits for another table; return what failed.
 
     Args:
-        runs: the tables; of those that are `finished`, nothing is trained.
-        jobs, cores: see `run_table`.
+        runs: the tables.
+        jobs, cores: see `begin_table`.
     """
     records = [run.interim for run in runs if run.interim is not None]
-    plans = {run.table.name: run.planned.named() for run in runs if not run.finished}
+    plans = {run.table.name: run.planned.named() for run in runs if run.interim is not None}
     every = {f"{table}: {row}": of_row for table, plan in plans.items() for row, of_row in plan.items()}
 
     def record(job: Job) -> None:
@@ -195,8 +182,8 @@ def finish_table(run: TableRun, failures: Sequence[Failure]) -> Path:
     """
     table, planned, folder, quick = run.table, run.planned, run.folder, run.quick
     configs, plan = planned.rows, planned.jobs
-    results, own = Results(tuple(configs), run.seeds, {}), {job.folder for job in planned.every()}
-    waiting = [Failure(job, "not finished") for job in tell_unfinished(planned)] if run.finished else []
+    results, own = Results(tuple(configs), tuple(planned.seeds()), {}), {job.folder for job in planned.every()}
+    waiting = [Failure(job, "not finished") for job in tell_unfinished(planned)] if run.interim is None else []
     told = waiting or [failure for failure in failures if failure.job.folder in own]
     trained, failures = evaluate_others(plan, told, results)
     _add_geometric(trained, results)

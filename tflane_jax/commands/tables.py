@@ -81,7 +81,7 @@ def run(options: argparse.Namespace) -> int:
             plan_table(table, seeds[table.name], options.out, archive=archives.get(table.name), **how)
     written: list[Path] = []
     failed: list[str] = []
-    noted = partial(_noted, failed, several=len(chosen) > 1)
+    noted = partial(_noted, failed, last=chosen[-1])
     groups = [chosen] if options.together else [[table] for table in chosen]
     for group in groups:
         begun = []
@@ -101,13 +101,13 @@ def run(options: argparse.Namespace) -> int:
 
 
 @contextlib.contextmanager
-def _noted(failed: list[str], table: PaperTable, *, several: bool) -> Iterator[None]:
+def _noted(failed: list[str], table: PaperTable, *, last: PaperTable) -> Iterator[None]:
     """Add an error inside the block to those of the tables that failed; the others go on."""
     try:
         yield
     except UserError as error:
         failed.append(f"{table.name}: {error}")
-        if several:
+        if table is not last:
             write(f"{failed[-1]}\nthe other tables go on")
 
 

@@ -134,7 +134,7 @@ def _train(config: RunConfig, folder: Path, *, start: Start, progress: bool, dra
 
 
 def check_origin(config: RunConfig) -> None:
-    """Raise UserError if the run to start from is missing, or frozen modules would start from random weights."""
+    """Raise UserError if the run to start from is missing, or frozen modules would start from no weights."""
     if config.training.init_from is not None:
         check_origins(config.training.init_from, config.training.seeds)
     if config.task.frozen and config.training.init_from is None:
@@ -142,7 +142,8 @@ def check_origin(config: RunConfig) -> None:
             f"{', '.join(config.task.frozen)} would stay random: this configuration freezes them "
             "(task.model.encoder.images.frozen_stages) and starts from no weights. Convert ImageNet's from a "
             "torchvision file (tflane convert --config FILE --weights resnet50.pth --out runs/imagenet) and set "
-            "training.init_from=runs/imagenet and training.init_partly; or train them, with frozen_stages 0"
+            "training.init_from=runs/imagenet and training.init_partly; or train them, with frozen_stages 0 and "
+            "backbone.frozen_norms false"
         )
 
 

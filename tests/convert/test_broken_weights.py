@@ -60,6 +60,7 @@ CHANGES = {
     "minus infinity": (_numbers(-np.inf), r"holds -inf at", ()),
     "all NaN": (_axes(lambda t: t * np.nan), r"(\d+) of \1 numbers are not finite", ()),
     "beyond float32": (_axes(lambda t: t.astype(np.float64) * 1e200), "numbers are not finite", ()),
+    "an enormous number": (_numbers(1e30), r"holds a number of size 1e\+30: no training leaves that", ()),
     "integers": (_type(np.int64), "holds int64, expected floating-point numbers", ()),
     "bytes": (_type(np.int8), "holds int8, expected floating-point numbers: weights that are quantised", ()),
     "truth values": (_type(bool), "holds bool, expected floating-point numbers", ()),
@@ -105,6 +106,21 @@ def test_broken_tensors_are_refused(case, path):
     assert said.startswith(str(path))
     assert re.search(message, said), said
     assert name in said or "does not fit the model" in said
+
+
+@pytest.mark.parametrize(("name", "said"), [(CONV, "no training leaves such a kernel"), (VARIANCE, "saw no image")])
+def test_tensors_of_zeros_are_refused(name, said, path):
+    state = lstr_state()
+    state[name] = np.zeros_like(state[name])
+    with pytest.raises(UserError, match=f"{re.escape(str(path))}: {name} is 0 throughout: .*{said}"):
+        load_lstr(write(path, state), TINY)
+
+
+@pytest.mark.parametrize("prefix", ["module.", "model.", "module.module.", "model.module."])
+def test_what_is_around_the_network_is_no_part_of_its_names(prefix, path):
+    plain = load_lstr(write(path, lstr_state()), TINY)
+    wrapped = load_lstr(write(path, {prefix + name: tensor for name, tensor in lstr_state().items()}), TINY)
+    jax.tree.map(np.testing.assert_array_equal, wrapped[0], plain[0])
 
 
 PROJECTION = "transformer.encoder.layers.0.self_attn.out_proj.weight"

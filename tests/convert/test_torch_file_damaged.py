@@ -57,8 +57,15 @@ def test_a_flipped_byte_never_escapes(tmp_path_factory, place, change, write):
         (b"", "the file is empty"),
         (
             b"version https://git-lfs.github.com/spec/v1\noid",
-            r"begins with 'version https://git-lfs.*Download it again",
+            r"a pointer of Git LFS in place of the file. Fetch the file: git lfs pull",
         ),
+        (
+            b"\x40\x00\x00\x00\x00\x00\x00\x00" + b'{"a": 1}'.ljust(64),
+            "a file of safetensors, which is not read. Load it",
+        ),
+        (b"\x89HDF\r\n\x1a\n" + bytes(64), "a file of HDF5"),
+        (b"\x93NUMPY\x01\x00" + bytes(64), "a file of one array"),
+        (b"\x08\x08\x12\x07pytorch" + bytes(64), "a file of ONNX"),
         (b"<!DOCTYPE html>\n<html>", r"begins with '<!DOCTYPE html>'.*Download it again"),
         (b"\x1f\x8b\x08\x00", "packed file. Unpack it"),
         (bytes(257) + b"ustar", "packed file. Unpack it"),

@@ -85,13 +85,12 @@ class DriveDataset:
 
 
 def _official(views: CameraViews) -> CameraViews:
-    """Return the views as the cameras of OpenLane-V2 look, with their focal lengths; other numbers of them stay."""
+    """Return the views from where OpenLane-V2's cameras are and look, with their focal lengths; other numbers stay."""
     rings = [ring for ring in (ARGOVERSE2_RING, NUSCENES_RING) if len(ring) == len(views.valid)]
     for i, mount in enumerate(rings[0] if rings else ()):
         turn = yaw_pose(0.0, 0.0, -np.deg2rad(mount.yaw))[:3, :3]
-        place = invert_pose(np.asarray(views.camera_from_ego[i], np.float64))[:3, 3]
         views.camera_from_ego[i, :3, :3] = AHEAD @ turn
-        views.camera_from_ego[i, :3, 3] = -AHEAD @ turn @ place
+        views.camera_from_ego[i, :3, 3] = -AHEAD @ turn @ [mount.x, mount.y, mount.z]
         focal = mount.focal * views.size[i, 0] / mount.width
         views.intrinsics[i, 0, 0] = views.intrinsics[i, 1, 1] = focal
     return views

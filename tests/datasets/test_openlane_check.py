@@ -155,6 +155,41 @@ def swap(content):
     left["extrinsic"], right["extrinsic"] = right["extrinsic"], left["extrinsic"]
 
 
+def every_file(folder, number, function):
+    for suffix in ("", "-ls"):
+        change(frame(folder, number, suffix), function)
+
+
+def farther(content):
+    for name in ("lane_centerline", "lane_segment"):
+        for lane in content["annotation"].get(name, []):
+            for line in lane.keys() & {"points", "centerline"}:
+                lane[line] = (100 * np.array(lane[line])).tolist()
+
+
+def test_lanes_of_another_scale_are_named(folder):
+    every_file(folder, 1, farther)
+    faults = check_openlane_v2(folder, progress=False).faults
+    assert len(faults) == 2
+    assert all(re.search(r"a lane reaches \d{4} m from the vehicle, expected some 50", fault) for fault in faults)
+
+
+def test_frames_that_a_training_does_not_see_are_named(folder):
+    (file,) = folder.glob("data_dict_*.json")
+    content = json.loads(file.read_text())
+    first = next(iter(content["train"]))
+    names = content["train"][first]
+    content["train"][first] = names[:1] + names[:2]
+    file.write_text(json.dumps(content))
+    found = check_openlane_v2(folder, progress=False)
+    assert found.faults == [f"{file}: 1 train frames are named twice"]
+    (said,) = found.skipped
+    assert f"{FRAMES - 2} of {FRAMES} train frames are named by no split file (first train/01000/" in said
+    file.unlink()
+    (said,) = check_openlane_v2(folder, progress=False).skipped
+    assert said.startswith(f"{file} is missing: a training takes its frames from it")
+
+
 def test_both_subsets_in_one_folder(folder, tmp_path):
     other = export_openlane_v2(
         {"train": DriveDataset(DriveConfig(scenes=1, cameras=7))}, tmp_path / "a", progress=False

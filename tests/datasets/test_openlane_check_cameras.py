@@ -52,10 +52,41 @@ def scaled(factor):
     return function
 
 
+def roll(degrees):
+    turn = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+
+    def function(content):
+        of = content["sensor"]["CAM_FRONT"]["extrinsic"]
+        of["rotation"] = (np.array(of["rotation"]) @ np.linalg.matrix_power(turn, degrees // 90)).tolist()
+
+    return function
+
+
+def of_another(content):
+    of = content["sensor"]["CAM_FRONT"]
+    of["image_path"] = of["image_path"].replace("CAM_FRONT", "CAM_BACK")
+
+
+def at(factor):
+    """Return the change that scales where a camera is; it looks on as before."""
+
+    def function(content):
+        of = content["sensor"]["CAM_FRONT"]["extrinsic"]
+        of["translation"] = [factor * value for value in of["translation"]]
+
+    return function
+
+
 @pytest.mark.parametrize(
     ("function", "said"),
     [
-        (millimetres, r"CAM_BACK is 2193 m from the vehicle's origin: is its translation in metres"),
+        (roll(90), "CAM_FRONT is rolled by 90 degrees, expected upright"),
+        (roll(180), "CAM_FRONT is rolled by 180 degrees, expected upright"),
+        (at(0.001), r"CAM_FRONT is at \(0.00, .*\) m, 2.3 m from where the datasets' cameras of this name are: is its"),
+        (at(2.0), r"CAM_FRONT is at .* m, 2.3 m from where"),
+        (at(-1.0), r"CAM_FRONT is at .* m, 4.5 m from where"),
+        (of_another, r"CAM_FRONT has the image .*, which is in the folder of CAM_BACK"),
+        (millimetres, r"CAM_BACK is 1580 m from the vehicle's origin: is its translation in metres"),
         (scaled(0.75), r"CAM_FRONT_LEFT has a focal length of 29 pixels in images of 48 x 32, expected about 38"),
         (
             swap,
@@ -84,6 +115,7 @@ def test_a_focal_length_is_compared_with_that_of_the_dataset(tmp_path, name, fac
     pose[:3, :3] = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]) * (
         [[-1.0], [-1.0], [1.0]] if name == "CAM_BACK" else 1.0
     )
+    pose[:3, 3] = {"CAM_BACK": (0.03, 0.0, 1.58), "ring_front_center": (1.64, 0.0, 1.4)}.get(name, (0.0, -0.5, 2.0))
     intrinsics = np.array([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
     intrinsics[:2] *= factor
     camera = FrameCamera(name, tmp_path / "image.png", intrinsics, pose)
@@ -142,6 +174,7 @@ def test_swapped_cameras_are_not_taken_for_inverted_ones(ring, tmp_path):
             pose[:2, 0] = np.sin(yaw), -np.cos(yaw)
             pose[:3, 1] = 0.0, 0.0, -1.0
             pose[:3, 2] = np.cos(yaw), np.sin(yaw), 0.0
+            pose[:3, 3] = b.x, b.y, b.z
             checks, camera = CameraChecks(), FrameCamera(a.name, tmp_path / "none.jpg", np.eye(3), pose)
             checks.check(SimpleNamespace(path=tmp_path, cameras=(camera,)))
             _, faults = checks.finish()

@@ -122,6 +122,23 @@ def test_columns_of_another_image_size_are_remarked(tmp_path, capsys, labels, ch
     assert f"% of the predicted lanes are near a true one, but 100% with {formula} in place of x: are they" in said
 
 
+@pytest.mark.parametrize(
+    ("change", "cause"),
+    [
+        (lambda lane: lane[::-1], "with the rows in reverse order: do they ascend"),
+        (lambda lane: lane[3:] + [-2] * 3, "3 rows further down: is the first number that of the first of h_samples?"),
+        (lambda lane: [-2] * 4 + lane[:-4], "4 rows further up: is the first number"),
+        (lambda lane: [1280 - x if x >= 0 else x for x in lane], "mirrored, with 1280 - x in place of x: is x counted"),
+    ],
+)
+def test_other_rows_and_mirrored_columns_are_remarked(tmp_path, capsys, change, cause):
+    guess = [{**one, "lanes": [change(lane) for lane in one["lanes"]]} for one in moved(real_labels(), lambda x: x)]
+    assert run(tmp_path, guess, real_labels())[0] == 0
+    said = capsys.readouterr().err
+    assert re.search(r"\d+% of the predicted lanes are near a true one, but \d+% ", said)
+    assert cause in said
+
+
 def test_columns_with_random_errors_have_no_remark(tmp_path, capsys):
     rng = np.random.default_rng(0)
     for error in (3.0, 12.0):

@@ -79,7 +79,7 @@ def run(options: argparse.Namespace) -> int:
     range_ = PerceptionRange() if model is None else model.source.example.range
     detector = _detector(options, store)
     config = ReaderConfig(detector, range_, today=_day(options), max_age_days=_age(options))
-    doubts = _doubtful_dates(store, _day(options), config.max_age_days)
+    doubts = [*_without_lanes(store), *_doubtful_dates(store, _day(options), config.max_age_days)]
     steps = MarkerDrive(MarkerReader(store, as_trained(config, model)), model)
     faults: dict[str, str] = {}
     if model is not None:
@@ -168,6 +168,14 @@ def _detector(options: argparse.Namespace, store: MarkerStore) -> DetectorConfig
 
 def _day(options: argparse.Namespace) -> datetime.date:
     return day_of(options.today, "--today") or datetime.date.today()
+
+
+def _without_lanes(store: MarkerStore) -> list[str]:
+    """Return a sentence for a store that can guide no frame."""
+    if any(len(entry.lanes) for entry in store.markers.values()):
+        return []
+    what = f"its {len(store.markers)} markers have no lanes" if store.markers else "it holds no marker"
+    return [f"{store.source}: {what}, so that no frame gets a prior: is it the right store?"]
 
 
 def _doubtful_dates(store: MarkerStore, today: datetime.date, max_age_days: int | None) -> list[str]:

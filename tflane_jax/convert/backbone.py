@@ -13,7 +13,16 @@ import jax
 import jax.numpy as jnp
 
 from tflane_jax.convert.lstr import RESNET
-from tflane_jax.convert.renaming import Converted, below, check_fits, check_types, convert, naming, size_text
+from tflane_jax.convert.renaming import (
+    Converted,
+    below,
+    check_fits,
+    check_types,
+    convert,
+    naming,
+    size_text,
+    without_wrappers,
+)
 from tflane_jax.convert.torch_file import read_checkpoint
 from tflane_jax.errors import UserError
 from tflane_jax.layers.batch_norm import STATISTICS
@@ -36,7 +45,7 @@ def is_backbone(names: Iterable[str], others: Iterable[str] = ()) -> bool:
         others: names of what else there is: only what should be a tensor counts.
     """
     names = [*names, *filter(_TENSOR.fullmatch, others)]
-    return "conv1.weight" in {name.removeprefix("module.") for name in names} and all(map(_TENSOR.fullmatch, names))
+    return "conv1.weight" in {without_wrappers(name) for name in names} and all(map(_TENSOR.fullmatch, names))
 
 
 def load_backbone(path: Path, model: HostConfig) -> tuple[Params, list[dict[str, str]]]:

@@ -42,7 +42,7 @@ def convert(state: Mapping[str, AnyArray], rules: Rules, network: str, frozen: s
     """Return variables by our names, and an account of every tensor.
 
     Args:
-        state: tensors by PyTorch's names, with or without the prefix `module.`.
+        state: tensors by PyTorch's names, with or without the prefixes `module.` and `model.`.
         rules: the first that fits a name decides.
         network: whose tensors these should be, for the message.
         frozen: our paths of norms that never learn, whose scales and biases are statistics too.
@@ -55,7 +55,7 @@ def convert(state: Mapping[str, AnyArray], rules: Rules, network: str, frozen: s
     variables: dict[str, Any] = {"params": {}, "batch_stats": {}}
     origin: dict[str, str] = {}
     for name, tensor in state.items():
-        plain, row = name.removeprefix("module."), {"tensor": name, "shape": size_text(tensor.shape)}
+        plain, row = without_wrappers(name), {"tensor": name, "shape": size_text(tensor.shape)}
         if why := left_out(plain):
             table.append(row | {"becomes": why})
             continue
@@ -76,10 +76,15 @@ def convert(state: Mapping[str, AnyArray], rules: Rules, network: str, frozen: s
     return Converted(variables, table)
 
 
+def without_wrappers(name: str) -> str:
+    """Return a tensor's name without what DataParallel, or a class around the network, puts before it."""
+    return _WRAPPERS.sub("", name)
+
+
 def check_types(others: Mapping[str, str], rules: Rules) -> None:
     """Raise UserError if an entry that is no tensor has the name of one; `others` says what they hold, by name."""
     for name, held in others.items():
-        plain = name.removeprefix("module.")
+        plain = without_wrappers(name)
         sort = next((sort for pattern, _, sort in rules if re.fullmatch(pattern, plain)), "unused")
         if sort != "unused" and left_out(plain) is None:
             raise UserError(f"{name} holds {held}, expected floating-point numbers")
@@ -159,6 +164,9 @@ def renamed(name: str, tensor: AnyArray, rules: Rules) -> dict[str, Any] | None:
     return None
 
 
+# Beyond any weight or statistic of a trained network.
+_LARGEST = 1e10
+_WRAPPERS = re.compile(r"(?:(?:module|model)\.)*")
 # Axes of a weight by the kind of layer; biases have one. Embeddings ("vector", "first_row") may have any.
 _AXES = {"conv": 4, "pointwise": 4, "linear": 2, "packed": 2, "pair": 2, "norm": 1}
 
@@ -200,6 +208,12 @@ def checked(name: str, tensor: AnyArray) -> AnyArray:
     if name.endswith("running_var") and (negative := tensor < 0.0).any():
         i = int(negative.argmax())
         raise UserError(f"{name} holds {tensor.flat[i]:g} at [{i}]: a variance is not negative; the file is damaged")
+    if name.endswith("running_var") and tensor.size and not tensor.any():
+        raise UserError(f"{name} is 0 throughout: statistics of a norm that saw no image, or the file is damaged")
+    if tensor.ndim == 4 and tensor.size and not tensor.any():
+        raise UserError(f"{name} is 0 throughout: no training leaves such a kernel, the file is damaged")
+    if tensor.size and (largest := float(np.abs(tensor).max())) > _LARGEST:
+        raise UserError(f"{name} holds a number of size {largest:.3g}: no training leaves that, the file is damaged")
     return tensor
 
 

@@ -106,6 +106,10 @@ def _contents(file: IO[bytes]) -> _Contents:
         raise Damaged("the file is empty. Download it again")
     if start[:2] == b"\x1f\x8b" or start[257:262] == b"ustar":
         raise Damaged("a packed file. Unpack it (tar xf, gunzip) and give the file inside")
+    if start.startswith(b"version https://git-lfs"):
+        raise Damaged("a pointer of Git LFS in place of the file. Fetch the file: git lfs pull")
+    if (kind := _other_format(start)) is not None:
+        raise Damaged(f"a file of {kind}, which is not read. Load it in Python and save the tensors by name as .npz")
     if not start.startswith(b"PK"):
         return _legacy_contents(file)
     archive = zipfile.ZipFile(file)
@@ -122,6 +126,18 @@ def _contents(file: IO[bytes]) -> _Contents:
     if f"{root}constants.pkl" in names:
         raise Damaged("a TorchScript program. Save its weights in PyTorch: torch.save(module.state_dict(), ...)")
     return _zip_contents(archive, root)
+
+
+def _other_format(start: bytes) -> str | None:
+    """Return of which well-known format for weights, that is not read, a file's first bytes are."""
+    if start[8:9] == b"{" and int.from_bytes(start[:8], "little") < 1 << 32:
+        return "safetensors"
+    if start.startswith(b"\x89HDF"):
+        return "HDF5 (Keras)"
+    if start.startswith(b"\x93NUMPY"):
+        return "one array (.npy)"
+    # ONNX is a protocol buffer: field 1 is the version, and the name of the program that wrote it follows as field 2.
+    return "ONNX" if start[:1] == b"\x08" and start[2:3] == b"\x12" else None
 
 
 def _nothing(key: str) -> bytes:

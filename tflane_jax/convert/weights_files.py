@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tflane_jax.convert.renaming import left_out
+from tflane_jax.convert.renaming import left_out, without_wrappers
 from tflane_jax.datasets.cache import cache_root
 from tflane_jax.errors import UserError
 
@@ -102,7 +102,7 @@ def digest_of(state: Mapping[str, np.ndarray]) -> str:
 
     Counters and the prefix `module.` do not count, so that the digest is the same for .pkl and .npz.
     """
-    plain = {name.removeprefix("module."): tensor for name, tensor in state.items()}
+    plain = {without_wrappers(name): tensor for name, tensor in state.items()}
     digest = hashlib.sha256()
     for name in sorted(plain):
         if left_out(name) is None:

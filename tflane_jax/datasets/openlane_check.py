@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from tflane_jax.datasets.base import SPLITS, ExampleConfig
+from tflane_jax.datasets.base import SPLITS, ExampleConfig, Split
 from tflane_jax.datasets.openlane_annotation import Annotation, read_annotation
 from tflane_jax.datasets.openlane_check_cameras import CameraChecks, Images
 from tflane_jax.datasets.openlane_check_collections import check_collections
@@ -37,6 +37,8 @@ from tflane_jax.progress import progress_bar
 _WITH_LOG, _WITHOUT_LOG, _WITH_TRAFFIC = "with log", "without log", "with traffic"
 # Name of the log of a segment whose files do not tell it; no log has it.
 _NO_LOG = ""
+# Metres from the vehicle: lanes are annotated up to 50 m ahead and behind.
+_FARTHEST = 200.0
 _COUNTS = ("segments", "frames", "-ls files", "images", "lanes", "lane segments", "elements", "areas", "SD maps")
 
 
@@ -48,7 +50,8 @@ class OpenLaneCheck:
         subset: "A", "B" or "A and B", by the cameras of each segment's first frame.
         rows: counts of each split, and of each subset where there are both, for a table.
         faults: sentences, each naming a file.
-        skipped: files that are none of the dataset's, what was not read, and the logs that frames lack.
+        skipped: files that are none of the dataset's, what was not read, the logs that frames lack, and
+            frames that a training would not see.
     """
 
     subset: str
@@ -117,8 +120,26 @@ def check_openlane_v2(
                 )
             both = {"subset": subset} if len(present) > 1 else {}
             rows.append({"split": split, **both, **content, "faults": len(faults) - found})
+    skipped += _not_named(root, named, on_disk, present)
     of_collections, not_read = check_collections(root, [key for keys in on_disk.values() for key in keys])
     return OpenLaneCheck(" and ".join(present), rows, [*faults, *of_collections], [*skipped, *not_read])
+
+
+def _not_named(
+    root: Path, named: dict[Split, list[FrameKey]], on_disk: dict[Split, list[FrameKey]], present: list[SubsetName]
+) -> Iterator[str]:
+    """Return which split files are missing, and how many frames of the others' splits a training would not see."""
+    for subset in present:
+        file = root / f"data_dict_subset_{subset}.json"
+        if not file.is_file():
+            yield f"{file} is missing: a training takes its frames from it, or all there are with data_dict folders"
+    for split, keys in on_disk.items():
+        unnamed = sorted(set(keys) - set(named[split])) if named[split] else []
+        if unnamed:
+            yield (
+                f"{len(unnamed)} of {len(keys)} {split} frames are named by no split file (first {unnamed[0]}): a "
+                "training does not see them, unless data.data_dict is folders"
+            )
 
 
 def _check_frames(
@@ -217,6 +238,8 @@ def _check_sd_maps(root: Path, keys: list[FrameKey], faults: list[str]) -> int:
 
 
 def _check_annotation(found: Annotation) -> Iterator[str]:
+    if (far := max((float(np.abs(line[:, :2]).max()) for line in found.lines), default=0.0)) > _FARTHEST:
+        yield f"a lane reaches {far:.0f} m from the vehicle, expected some 50: metres, in the ego frame?"
     if (np.diff(found.boxes, axis=1) <= 0.0).any():
         yield "a traffic element's box has no area: its points should be the top-left and the bottom-right corner"
     lights = np.isin(found.attribute, (1, 2, 3))

@@ -31,9 +31,10 @@ _FRAME_STARTS, _SCAN = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}, 0xDA
 # of a progressive file (tables, scan) or ends the image; and a hole.
 _STRANGE = re.compile(rb"\xff[^\x00\xd0-\xd9\xda\xc4\xdb\xdd\xfe\xff]|\x00{4096}")
 # Degrees between the optical axis and where a camera of this name looks; a fraction of the image's size between its
-# middle and the principal point; metres from the vehicle's origin; focal length in widths of the image, and relative to
+# middle and the principal point; metres from the vehicle's origin, and from where the datasets' cameras of this name
+# are, which differ by centimetres; focal length in widths of the image, and relative to
 # that of the datasets' cameras of this name, which differ by 3 %.
-_TURNED, _ASIDE, _FARTHEST, _FOCAL, _NOMINAL = 35.0, 0.15, 5.0, (0.25, 4.0), 0.1
+_TURNED, _ASIDE, _FARTHEST, _MOVED, _FOCAL, _NOMINAL = 35.0, 0.15, 5.0, 0.4, (0.25, 4.0), 0.1
 _MOUNTS = {mount.name: mount for mount in (*ARGOVERSE2_RING, *NUSCENES_RING)}
 
 
@@ -65,7 +66,11 @@ class CameraChecks:
                 self._sizes[camera.name][size] += 1
                 self._strange.setdefault((segment, camera.name, size), _Repeated(str(camera.image))).count += 1
             where = f"{frame.path}: {camera.name}"
-            every = {"direction": _direction(camera), "place": _place(camera), "scale": _scale(camera, size)}
+            every = {
+                "image": _of_another(camera),
+                "pose": _direction(camera) or _place(camera),
+                "scale": _scale(camera, size),
+            }
             for kind, found in every.items():
                 if found is not None:
                     key = (segment, camera.name, kind, size if kind == "scale" else None)
@@ -165,12 +170,22 @@ def _scan_start(content: bytes) -> int:
     return len(content)
 
 
+def _of_another(camera: FrameCamera) -> str | None:
+    """Return what is wrong with an image that is in the folder of another camera."""
+    others = [name for name in camera.image.parts if name in _MOUNTS and name != camera.name]
+    if not others or camera.name in camera.image.parts:
+        return None
+    return f"has the image {camera.image}, which is in the folder of {others[-1]}"
+
+
 def _direction(camera: FrameCamera) -> str | None:
     """Return what is wrong with where a camera looks."""
     axis = camera.ego_from_camera[:3, 2]
     mount = _MOUNTS.get(camera.name)
-    if mount is None or _apart(axis, mount.yaw) <= _TURNED:
+    if mount is None:
         return None
+    if _apart(axis, mount.yaw) <= _TURNED:
+        return _rolled(camera)
     expected = mount.yaw
     looks, other = float(np.rad2deg(np.arctan2(axis[1], axis[0]))), _others(axis, camera.name)
     text = f"looks to {looks:.0f} degrees (left of ahead), expected about {expected:.0f}"
@@ -183,6 +198,15 @@ def _direction(camera: FrameCamera) -> str | None:
     if other is not None:
         return f"{text}, where {other} should look: are their calibrations swapped?"
     return f"{text}: is its extrinsic that of the camera's axes (x right, y down, z ahead) in the ego frame?"
+
+
+def _rolled(camera: FrameCamera) -> str | None:
+    """Return what is wrong with how a camera is turned about its optical axis."""
+    down = camera.ego_from_camera[:3, 1] @ np.array([0.0, 0.0, -1.0])
+    if down >= np.cos(np.deg2rad(_TURNED)):
+        return None
+    degrees = float(np.rad2deg(np.arccos(np.clip(down, -1.0, 1.0))))
+    return f"is rolled by {degrees:.0f} degrees, expected upright: does the y axis of its extrinsic point down?"
 
 
 def _inverted(camera: FrameCamera, yaw: float) -> bool:
@@ -212,9 +236,20 @@ def _apart(axis: Float[np.ndarray, "3"], yaw: float) -> float:
 def _place(camera: FrameCamera) -> str | None:
     """Return what is wrong with where a camera is."""
     metres = float(np.linalg.norm(camera.ego_from_camera[:3, 3]))
-    if metres <= _FARTHEST:
+    if metres > _FARTHEST:
+        return f"is {metres:.0f} m from the vehicle's origin: is its translation in metres, and of this vehicle?"
+    mount = _MOUNTS.get(camera.name)
+    if mount is None:
         return None
-    return f"is {metres:.0f} m from the vehicle's origin: is its translation in metres, and of this vehicle?"
+    nominal = np.array([mount.x, mount.y, mount.z])
+    apart = float(np.linalg.norm(camera.ego_from_camera[:3, 3] - nominal))
+    if apart <= _MOVED:
+        return None
+    there = ", ".join(f"{value:.2f}" for value in camera.ego_from_camera[:3, 3])
+    return (
+        f"is at ({there}) m, {apart:.1f} m from where the datasets' cameras of this name are: is its translation in "
+        "metres, in the ego frame, and that of this camera?"
+    )
 
 
 def _scale(camera: FrameCamera, size: tuple[int, int] | None) -> str | None:

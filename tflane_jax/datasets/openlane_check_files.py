@@ -36,6 +36,8 @@ def named_frames(root: Path, faults: list[str]) -> dict[Split, list[FrameKey]]:
                     for key in keys
                     if not key.timestamp.isdecimal()
                 ]
+                if twice := len(keys) - len(set(keys)):
+                    faults.append(f"{file}: {twice} {split} frames are named twice")
                 named[split] += [key for key in keys if key.timestamp.isdecimal()]
         except UserError as error:
             faults.append(str(error))

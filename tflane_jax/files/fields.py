@@ -77,6 +77,8 @@ def read_text(path: Path, what: str = "JSON file") -> str:
         return path.read_text(encoding="utf-8-sig")
     except OSError as error:
         raise UserError(f"cannot read {path}: {error.strerror}") from None
+    except MemoryError:
+        raise UserError(f"cannot read {path}: it does not fit into memory") from None
     except UnicodeDecodeError:
         raise UserError(f"{path} is no {what}: it is not text") from None
 
@@ -314,14 +316,6 @@ def is_name(value: Any) -> bool:
     # Python refuses to write integers of more than 4300 digits.
     whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
     return is_text(value) or (whole and abs(int(value)) < 2**64)
-
-
-def check_there(path: Path) -> None:
-    """Raise UserError where there is no file or folder of this name."""
-    try:
-        path.stat()
-    except OSError as error:
-        raise UserError(f"cannot read {path}: {error.strerror}") from None
 
 
 def is_time(text: str) -> bool:

@@ -106,6 +106,8 @@ def _lanes(record: Any, where: str, *, timed: bool) -> RowLanes:
         if time < 0.0:
             raise UserError(f"{where}: run_time is {time:g}, expected milliseconds")
     rows = _rows(record, where) if not timed or "h_samples" in record else None
+    if rows is not None and not timed and not len(rows):
+        raise UserError(f"{where}: h_samples is empty, expected the rows of the image at which lanes are labelled")
     lanes = [
         numbers(lane, (None if rows is None else len(rows),), f"{where}: lanes[{i}]", largest=_WIDEST)
         for i, lane in enumerate(items(record, "lanes", where))

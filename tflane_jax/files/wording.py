@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import reprlib
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 _LONGEST_NAME = 200
+_NAMED = 3
 
 
 def shown(value: Any) -> str:
@@ -44,6 +46,11 @@ def named(name: Any) -> str:
     text = str(name)
     plain = text.isprintable() and text == text.strip() and text
     return f"{text if plain else repr(text):.{_LONGEST_NAME}}"
+
+
+def first_of(names: Sequence[Any]) -> str:
+    """Return the first few of several names."""
+    return ", ".join(map(named, names[:_NAMED])) + (", ..." if len(names) > _NAMED else "")
 
 
 def digits(number: np.floating | np.integer) -> str:

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Float
 
-from tflane_jax.files.tusimple import RowLanes
+from tflane_jax.files.tusimple import SIZE, RowLanes
 from tflane_jax.files.wording import named
 from tflane_jax.metrics.tusimple import pixel_thresholds
 
 # Of the predicted lanes, at most so many are near a true one if they are of another image; at least so many after the
 # right scale and shift. Labels of other images of the same road, in place of predictions, have 0.1 to 0.4 in both.
 _FEW, _MOST = 0.2, 0.6
+# Rows by which predictions may be shifted.
+_ROWS_OFF = 12
+# Within this fraction of the metric's threshold, rows that are one off do not fit as well as the right ones.
+_CLOSE = 0.1
 # Predicted columns of so many times the widest true one are outside of any image that has these lanes.
 _OUTSIDE = 2.0
 # Images that scale and shift are taken from.
@@ -24,12 +28,14 @@ _Pair = tuple[Float[np.ndarray, "p h"], Float[np.ndarray, "g h"], Float[np.ndarr
 
 
 def columns(predictions: Mapping[str, RowLanes], truth: Mapping[str, RowLanes]) -> list[str]:
-    """Return remarks on columns that seem to be of another image size or crop, or lie far outside of the image."""
+    """Return remarks on columns of other rows, another image size or crop, mirrored or far outside of the image."""
     pairs = _pairs(predictions, truth)
     if not pairs:
         return []
     near = _near(pairs)
     remarks = _outside(predictions, max(float(true.max()) for _, true, _ in pairs))
+    if (found := _rearranged(pairs, near)) is not None:
+        return [found]
     if near <= _FEW:
         scale, shift = _fit(pairs[:: -(-len(pairs) // _IMAGES)])
         moved = [(np.where(x >= 0.0, scale * x + shift, -1.0), true, widths) for x, true, widths in pairs]
@@ -42,6 +48,42 @@ def columns(predictions: Mapping[str, RowLanes], truth: Mapping[str, RowLanes]) 
     if near == 0.0 and not remarks:
         return ["no predicted lane is near a true one: are x pixels of the labelled image, from its left border?"]
     return remarks
+
+
+def _rearranged(pairs: Sequence[_Pair], near: float) -> str | None:
+    """Return a remark if most lanes would be near a true one with other rows or mirrored; `near` of them are as is."""
+    if near > _MOST:
+        return None
+    shifts = [rows for rows in range(-_ROWS_OFF, _ROWS_OFF + 1) if rows]
+    changes = {
+        "with the rows in reverse order: do they ascend, as h_samples do?": lambda x: x[:, ::-1],
+        f"mirrored, with {SIZE[1]} - x in place of x: is x counted from the left border?": lambda x: np.where(
+            x >= 0.0, SIZE[1] - x, -1.0
+        ),
+        **{
+            f"{abs(rows)} rows further {'down' if rows > 0 else 'up'}: is the first number that of the first of "
+            "h_samples?": lambda x, rows=rows: _moved(x, rows)
+            for rows in shifts
+        },
+    }
+    few = pairs[:: -(-len(pairs) // _IMAGES)]
+
+    def near_then(change: Callable[[np.ndarray], np.ndarray], within: float = 1.0) -> float:
+        return _near([(change(x), true, within * widths) for x, true, widths in few])
+
+    best = max(changes, key=lambda name: (near_then(changes[name], _CLOSE), near_then(changes[name])))
+    if (then := near_then(changes[best])) < max(_MOST, 2.0 * near):
+        return None
+    return f"{near:.0%} of the predicted lanes are near a true one, but {then:.0%} {best}"
+
+
+def _moved(x: Float[np.ndarray, "p h"], rows: int) -> Float[np.ndarray, "p h"]:
+    """Return columns so many rows further down; those that leave the image are lost."""
+    moved = np.full_like(x, -1.0)
+    count = x.shape[1]
+    if abs(rows) < count:
+        moved[:, max(rows, 0) : count + min(rows, 0)] = x[:, max(-rows, 0) : count - max(rows, 0)]
+    return moved
 
 
 def _pairs(predictions: Mapping[str, RowLanes], truth: Mapping[str, RowLanes]) -> list[_Pair]:
@@ -60,7 +102,8 @@ def _near(pairs: Sequence[_Pair]) -> float:
     for found, true, thresholds in pairs:
         both = (found[:, None] >= 0.0) & (true >= 0.0)
         close = both & (np.abs(found[:, None] - true) < thresholds[:, None])
-        near += int((2 * close.sum(-1).max(-1) >= (found >= 0.0).sum(-1)).sum())
+        points = (found >= 0.0).sum(-1)
+        near += int(((2 * close.sum(-1).max(-1) >= points) & (points > 0)).sum())
         total += len(found)
     return near / total
 

@@ -51,7 +51,7 @@ def read_truth(path: Path) -> dict[PlainKey, LaneTruth]:
     for key, record, where in _frames(path):
         if "scores" in record:
             raise UserError(f"{where} has scores, so that {path} is a file of predictions: give the ground truth")
-        lanes = _lines(record, where)
+        lanes = _lines(record, where, least=2)
         successor = choices(member(record, "successor", where), (len(lanes), len(lanes)), f"{where}: successor")
         visibility = _column(record, "visibility", where) if "visibility" in record else None
         frames[key] = LaneTruth(lanes, successor, visibility=visibility)
@@ -110,8 +110,10 @@ def _npz_records(path: Path) -> Iterator[dict[str, Any]]:
         yield record
 
 
-def _lines(record: Any, where: str) -> list[np.ndarray]:
-    return [line_points(line, f"{where}: points[{i}]") for i, line in enumerate(items(record, "points", where))]
+def _lines(record: Any, where: str, least: int = 1) -> list[np.ndarray]:
+    """Return the lines, each of at least so many points."""
+    lines = enumerate(items(record, "points", where))
+    return [line_points(line, f"{where}: points[{i}]", least) for i, line in lines]
 
 
 def _successor(record: Any, where: str) -> np.ndarray:

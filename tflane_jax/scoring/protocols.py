@@ -11,7 +11,7 @@ from typing import Any
 
 from tflane_jax.errors import UserError
 from tflane_jax.files import tusimple
-from tflane_jax.files.fields import PICKLE_SUFFIXES, check_there
+from tflane_jax.files.fields import PICKLE_SUFFIXES
 from tflane_jax.files.openlane import FrameKey
 from tflane_jax.metrics.f_score import CenterlineFScore
 from tflane_jax.metrics.groups import ByDistance, GroupedMetrics, LaneMetrics
@@ -22,7 +22,7 @@ from tflane_jax.metrics.topology import Version
 from tflane_jax.metrics.tusimple import LSTR_TIME_LIMIT, OFFICIAL_TIME_LIMIT, TuSimpleMetrics
 from tflane_jax.metrics.vector_map import VectorMapMetrics
 from tflane_jax.scoring import maptr, openlane_v2, plain, remarks
-from tflane_jax.scoring.recognise import Format, Side, hint
+from tflane_jax.scoring.recognise import Format, Side, check_there, hint
 from tflane_jax.scoring.score import Accumulator, numbers_of
 
 

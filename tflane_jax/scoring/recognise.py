@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import stat
 import zipfile
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
+from tflane_jax.errors import UserError
 from tflane_jax.files.plain_pickle import load_plain_pickle
 
 Side = Literal["predictions", "ground truth"]
@@ -31,6 +33,16 @@ class Content(NamedTuple):
     format: Format
     side: Side
     remedy: str = ""
+
+
+def check_there(path: Path) -> None:
+    """Raise UserError where there is no file or folder of this name, or a device, which may have no end."""
+    try:
+        mode = path.stat().st_mode
+    except OSError as error:
+        raise UserError(f"cannot read {path}: {error.strerror}") from None
+    if stat.S_ISCHR(mode) or stat.S_ISBLK(mode):
+        raise UserError(f"cannot read {path}: it is a device, expected a file")
 
 
 def hint(path: Path, side: Side, formats: Sequence[Format], protocols: Mapping[str, Sequence[Format]]) -> str:

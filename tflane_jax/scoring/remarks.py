@@ -2,24 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import numpy as np
 
-from tflane_jax.files.tusimple import ROWS, RowLanes
-from tflane_jax.files.wording import named
+from tflane_jax.files.tusimple import NO_POINT, ROWS, RowLanes
+from tflane_jax.files.wording import first_of, named
 from tflane_jax.metrics.frames import ElementDetections, ElementTruth, LaneDetections, LaneTruth, Lines
 from tflane_jax.metrics.map_matching import MapDetections, MapTruth
 from tflane_jax.metrics.segment_matching import SegmentDetections, SegmentTruth
 from tflane_jax.metrics.tusimple import LSTR_TIME_LIMIT, MORE_LANES
 from tflane_jax.scoring.columns import columns
+from tflane_jax.scoring.lines import no_lines, swapped_sides, unusual
 from tflane_jax.scoring.openlane_v2 import AREA_POINTS, CENTERLINE_POINTS, LINE_POINTS
 
 Remarks = Callable[[Mapping[Any, Any], Mapping[Any, Any]], list[str]]
 # Lines of one side that are so many times as far away as those of the other are of other units.
 _OTHER_UNITS = 8.0
-_NAMED = 3
+# Of the points of TuSimple's lanes, so many are at x = 0 if that stands for no point.
+_ZEROS = 0.05
 
 
 def no_remarks(predictions: Mapping[Any, Any], truth: Mapping[Any, Any]) -> list[str]:
@@ -42,8 +44,11 @@ def units(
     predictions: Mapping[Any, LaneDetections] | Mapping[Any, MapDetections],
     truth: Mapping[Any, LaneTruth] | Mapping[Any, MapTruth],
 ) -> list[str]:
-    """Return a remark where centerlines or lines of a map seem to be of other units."""
-    return _units(_lines(predictions, lambda one: one.points), _lines(truth, lambda one: one.points))
+    """Return remarks on centerlines or lines of a map: what `unusual` finds, and other units."""
+    return [
+        *unusual(predictions, truth),
+        *_units(_lines(predictions, lambda one: one.points), _lines(truth, lambda one: one.points)),
+    ]
 
 
 def segments(predictions: Mapping[Any, SegmentDetections], truth: Mapping[Any, SegmentTruth]) -> list[str]:
@@ -60,12 +65,18 @@ def segments(predictions: Mapping[Any, SegmentDetections], truth: Mapping[Any, S
         *_boxes("predicted", [one.lanes.elements for one in predictions.values()]),
         *_boxes("true", [one.lanes.elements for one in truth.values()]),
     ]
-    return [*(remark for remarks in counts for remark in remarks), *areas, *units, *boxes]
+    sides = [*swapped_sides("predicted", predictions), *swapped_sides("true", truth)]
+    counted = [remark for remarks in counts for remark in remarks]
+    return [*unusual(predictions, truth), *sides, *counted, *areas, *units, *boxes]
 
 
 def images(predictions: Mapping[Any, RowLanes], truth: Mapping[Any, RowLanes], time_limit: float) -> list[str]:
     """Return remarks on images that count as without lanes, on other rows and on other columns; the limit: ms."""
     return [
+        *no_lines("predictions", (one.x for one in predictions.values())),
+        *no_lines("ground truth", (one.x for one in truth.values())),
+        *_at_zero("predicted", predictions),
+        *_at_zero("true", truth),
         *_slow(predictions, time_limit),
         *_too_many(predictions, truth),
         *_other_rows(truth),
@@ -89,6 +100,18 @@ def nothing_near(
     return [f"no predicted line is near a true one: are axes, units and frame those of the ground truth, {frame}?"]
 
 
+def _at_zero(side: str, images: Mapping[Any, RowLanes]) -> list[str]:
+    """Return a remark on lanes that seem to have x = 0 where they have no point."""
+    points = np.concatenate([one.x[one.x >= 0.0] for one in images.values()])
+    zeros = int((points == 0.0).sum())
+    if zeros <= _ZEROS * len(points):
+        return []
+    return [
+        f"{zeros} of {len(points)} points of {side} lanes are at x = 0, the image's left border: rows in which a lane "
+        f"has no point are marked by {NO_POINT:g}"
+    ]
+
+
 def _slow(predictions: Mapping[Any, RowLanes], time_limit: float) -> list[str]:
     slow = [key for key, one in predictions.items() if one.run_time > time_limit]
     if not slow:
@@ -96,7 +119,7 @@ def _slow(predictions: Mapping[Any, RowLanes], time_limit: float) -> list[str]:
     lenient = f"; tusimple-lstr allows {LSTR_TIME_LIMIT / 1000:g} s" if time_limit < LSTR_TIME_LIMIT else ""
     return [
         f"{len(slow)} of {len(predictions)} images took longer than {time_limit:g} ms and count as without lanes, by "
-        f"TuSimple's rule ({_named(slow)}){lenient}"
+        f"TuSimple's rule ({first_of(slow)}){lenient}"
     ]
 
 
@@ -106,7 +129,7 @@ def _too_many(predictions: Mapping[Any, RowLanes], truth: Mapping[Any, RowLanes]
         return []
     return [
         f"{len(many)} of {len(predictions)} images have over {MORE_LANES} lanes more than their labels and count as "
-        f"without lanes, by TuSimple's rule ({_named(many)}): leave out lanes of low confidence"
+        f"without lanes, by TuSimple's rule ({first_of(many)}): leave out lanes of low confidence"
     ]
 
 
@@ -116,7 +139,7 @@ def _other_rows(truth: Mapping[Any, RowLanes]) -> list[str]:
         return []
     return [
         f"{len(other)} of {len(truth)} frames are labelled at other rows than TuSimple's, every 10th from "
-        f"{ROWS[0]:g} to {ROWS[-1]:g} ({_named(other)}): are h_samples shifted, or of another image size?"
+        f"{ROWS[0]:g} to {ROWS[-1]:g} ({first_of(other)}): are h_samples shifted, or of another image size?"
     ]
 
 
@@ -136,7 +159,7 @@ def _other_counts(what: str, frames: Mapping[Any, Lines], count: int) -> list[st
     if not other:
         return []
     return [
-        f"{len(other)} of {total} {what} have other than the official {count} points ({_named(other)}). Distances "
+        f"{len(other)} of {total} {what} have other than the official {count} points ({first_of(other)}). Distances "
         "compare vertices, so that even the right line may not match: resample them"
     ]
 
@@ -173,7 +196,3 @@ def _extent(frames: Iterable[Lines]) -> float | None:
     reach = [max(float(np.abs(np.asarray(line)[:, :2]).max()) for line in lines) for lines in frames if len(lines)]
     extent = float(np.median(reach)) if reach else 0.0
     return extent if extent > 0.0 else None
-
-
-def _named(names: Sequence[Any]) -> str:
-    return ", ".join(map(named, names[:_NAMED])) + (", ..." if len(names) > _NAMED else "")

@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from tflane_jax.errors import UserError
-from tflane_jax.files.fields import as_list, check_there, is_name, is_text, load_file, member
+from tflane_jax.files.fields import as_list, is_name, is_text, load_file, member
 from tflane_jax.files.wording import named, shown
+from tflane_jax.scoring.recognise import check_there
 
 
 def read_scenes(path: Path) -> dict[str, str]:

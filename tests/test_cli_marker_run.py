@@ -141,6 +141,18 @@ def test_dates_that_make_no_sense_are_told(drive, tmp_path, capsys, surveyed, wo
     assert words in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("empty", "words"),
+    [(True, "it holds no marker, so that no frame gets a prior"), (False, "its 2 markers have no lanes, so that no")],
+)
+def test_a_store_that_guides_no_frame_is_told(drive, tmp_path, capsys, empty, words):
+    record = json.loads((drive / "store.json").read_text())
+    markers = [marker | {"lanes": [], "successors": []} for marker in record["markers"]]
+    (tmp_path / "store.json").write_text(json.dumps(record | {"markers": [] if empty else markers}))
+    assert main(arguments(drive, tmp_path / "out", store=tmp_path / "store.json")) == 0
+    assert words in capsys.readouterr().err
+
+
 def test_a_board_without_lanes_is_not_used(drive, tmp_path, capsys):
     record = json.loads((drive / "store.json").read_text())
     record["markers"][0] |= {"lanes": [], "successors": []}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import datetime
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -48,6 +49,12 @@ def run(options: argparse.Namespace) -> int:
         )
     print(format_table(rows, title=f"{log.name}: markers and the lanes within {options.radius:g} m of each"))
     print(f"\nwritten to {path} ({path.stat().st_size / 1000:.0f} kB)")
+    if without := [row["marker"] for row in rows if not row["lanes"]]:
+        print(
+            f"tflane: warning: {len(without)} of {len(rows)} markers have no lanes (first: {without[0]}), and so give "
+            "no prior: is --radius too small?",
+            file=sys.stderr,
+        )
     return 0
 
 

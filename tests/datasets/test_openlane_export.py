@@ -86,7 +86,7 @@ def test_the_layout_is_the_official_one(exported):
     assert (exported / front["image_path"]).is_file()
     rotation = np.array(front["extrinsic"]["rotation"])
     np.testing.assert_allclose(rotation[:, 2], [1, 0, 0], atol=1e-6)  # camera to ego: it looks along x
-    assert front["extrinsic"]["translation"] == pytest.approx([1.5, 0.0, 1.6])
+    assert front["extrinsic"]["translation"] == pytest.approx([1.7, 0.0, 1.51])
     lanes = frame["annotation"]["lane_centerline"]
     assert [len(lane["points"]) for lane in lanes] == [201] * 3
     assert all(isinstance(lane["id"], str) for lane in lanes)

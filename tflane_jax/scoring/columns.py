@@ -71,7 +71,7 @@ def _rearranged(pairs: Sequence[_Pair], near: float) -> str | None:
     def near_then(change: Callable[[np.ndarray], np.ndarray], within: float = 1.0) -> float:
         return _near([(change(x), true, within * widths) for x, true, widths in few])
 
-    best = max(changes, key=lambda name: (near_then(changes[name], _CLOSE), near_then(changes[name])))
+    best = max(changes, key=lambda name: near_then(changes[name], _CLOSE))
     if (then := near_then(changes[best])) < max(_MOST, 2.0 * near):
         return None
     return f"{near:.0%} of the predicted lanes are near a true one, but {then:.0%} {best}"

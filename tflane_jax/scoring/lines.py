@@ -31,9 +31,9 @@ def unusual(predictions: Mapping[Any, Any], truth: Mapping[Any, Any]) -> list[st
 
 def no_lines(side: str, frames: Iterable[Lines]) -> list[str]:
     """Return a remark where not one frame has a line; `side` is "predictions" or "ground truth"."""
-    return (
-        [] if any(len(lines) for lines in frames) else [f"no frame of the {side} has a line: is this the right file?"]
-    )
+    if any(len(lines) for lines in frames):
+        return []
+    return [f"no frame of the {side} has a line: is this the right file?"]
 
 
 def swapped_sides(side: str, frames: Mapping[Any, SegmentDetections] | Mapping[Any, SegmentTruth]) -> list[str]:

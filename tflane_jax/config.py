@@ -11,10 +11,11 @@ import dataclasses
 import difflib
 import re
 import traceback
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextvars import ContextVar
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from tflane_jax.config_files import find_config, is_shipped, split_reference
 from tflane_jax.config_io import part_classes
@@ -54,6 +55,7 @@ else:
 T = TypeVar("T")
 _STEP_COUNTS = ("steps", "eval_every", "checkpoint_every")  # of `TrainingConfig`
 _RUNNING = set[tuple[Path, str]]()  # functions of configuration files, with their files
+_RESULTS: ContextVar[dict[tuple[Path, str], Any] | None] = ContextVar("results", default=None)  # of `loaded_once`
 # Configuration files import data classes from here or from their dataset's file.
 __all__ = [
     "EvaluationConfig",
@@ -105,7 +107,22 @@ def load_config(reference: str) -> RunConfig:
         UserError: no such file, name, function or ablation, an exception inside the file, or a setting that breaks a
             limit (both named with the line).
     """
-    name, ablation = split_reference(reference)
+    with loaded_once():
+        return _load_config(*split_reference(reference))
+
+
+@contextlib.contextmanager
+def loaded_once() -> Iterator[None]:
+    """Run a function of a configuration file once within this block, however many configurations build on it."""
+    token = _RESULTS.set({}) if _RESULTS.get() is None else None
+    try:
+        yield
+    finally:
+        if token is not None:
+            _RESULTS.reset(token)
+
+
+def _load_config(name: str, ablation: str) -> RunConfig:
     if not ablation:
         config = _run_function(find_config(name), "get_config", RunConfig)
         return _checked(find_config(name), with_reference_batch(config, config))
@@ -189,7 +206,7 @@ def load_ablations(name: str) -> dict[str, RunConfig]:
 
     Their settings are not checked; `load_config` does that for one of them.
     """
-    return _run_function(find_config(name), "ablations", dict)
+    return dict(_run_function(find_config(name), "ablations", dict))
 
 
 def with_priors_of(other: RunConfig, config: RunConfig) -> RunConfig:
@@ -241,16 +258,21 @@ def _run_function(path: Path, function: str, kind: type[T]) -> T:
         module = import_file(path, beside=not is_shipped(path))
     if not hasattr(module, function):
         raise UserError(f"config file {path} has no function {function}()")
-    if (running := (path.resolve(), function)) in _RUNNING:
+    results, key = _RESULTS.get(), (path.resolve(), function)
+    if results is not None and key in results:
+        return results[key]
+    if key in _RUNNING:
         raise UserError(f"config file {path} loads itself")
-    _RUNNING.add(running)
+    _RUNNING.add(key)
     try:
         with _named_errors(path):
             value = getattr(module, function)()
     finally:
-        _RUNNING.remove(running)
+        _RUNNING.remove(key)
     if not isinstance(value, kind):
         raise UserError(f"{function}() in config file {path} gave a {type(value).__name__}, not a {kind.__name__}")
+    if results is not None:
+        results[key] = value
     return value
 
 

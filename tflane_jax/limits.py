@@ -143,79 +143,98 @@ def check_settings(config: Any, prefix: str = "") -> None:
         config: frozen dataclass, with others inside.
         prefix: name of the configuration itself with a dot behind, "" for a whole run.
     """
-    for name, value, hint in _settings(config, prefix):
-        if not _fits(hint, value):
-            raise SettingError(name, value, _described(hint))
-    # Rules over several settings may divide by them and compare them, so each by itself comes first.
-    for name, part in _parts(config, prefix):
+    parts = list(_parts(config, prefix))
+    for name, part in parts:
+        for setting, hint, fits in _checks(type(part)):
+            if not fits(value := getattr(part, setting)):
+                raise SettingError(name + setting, value, _described(hint))
+    # Rules over several settings may divide by them and compare them, so each by itself comes first. Those of a part
+    # come before those of the whole.
+    for name, part in reversed(parts):
         for setting, allowed, wanted in getattr(part, "limits", tuple)():
             if not allowed:
                 raise SettingError(name + setting, attrgetter(setting)(part), wanted)
 
 
-def _settings(config: Any, prefix: str) -> Iterator[tuple[str, Any, Any]]:
-    """Yield name, value and type of all settings; those of a part only after the part itself."""
-    hints = _hints(type(config))
-    for field in dataclasses.fields(config):
-        name, value = prefix + field.name, getattr(config, field.name)
-        yield name, value, hints[field.name]
-        for path, part in _dataclasses(name, value):
-            yield from _settings(part, f"{path}.")
-
-
 def _parts(config: Any, prefix: str) -> Iterator[tuple[str, Any]]:
-    """Yield all configurations with the prefixes of their settings, inner ones before outer ones."""
-    for field in dataclasses.fields(config):
-        for path, part in _dataclasses(prefix + field.name, getattr(config, field.name)):
-            yield from _parts(part, f"{path}.")
+    """Yield all configurations with the prefixes of their settings, outer ones before inner ones."""
     yield prefix, config
+    for field in dataclasses.fields(config):
+        for path, part in _dataclasses(field.name, getattr(config, field.name)):
+            yield from _parts(part, f"{prefix}{path}.")
 
 
 def _dataclasses(name: str, value: Any) -> Iterator[tuple[str, Any]]:
     """Yield a configuration by its name, or those of a tuple by name and position."""
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        yield name, value
-    elif isinstance(value, tuple):
+    if isinstance(value, tuple):
         for index, item in enumerate(value):
             yield from _dataclasses(f"{name}[{index}]", item)
+    elif dataclasses.is_dataclass(value) and not isinstance(value, type):
+        yield name, value
 
 
 def forget_types() -> None:
     """Look at the types of settings again, because a union of classes has got another member."""
-    _hints.cache_clear()
+    _checks.cache_clear()
 
 
 @functools.cache
-def _hints(kind: type) -> dict[str, Any]:
-    return typing.get_type_hints(kind, include_extras=True)
+def _checks(kind: type) -> list[tuple[str, Any, Callable[[Any], bool]]]:
+    """Return name and type of the settings of a class, and what tells whether a value is of the type."""
+    hints = typing.get_type_hints(kind, include_extras=True)
+    return [(field.name, hints[field.name], _check(hints[field.name])) for field in dataclasses.fields(kind)]
 
 
-def _fits(hint: Any, value: Any, *, finite: bool = True) -> bool:
-    """Return whether a value is of a type and within its limits; `finite` forbids infinite and undefined numbers."""
+def _check(hint: Any, *, finite: bool = True) -> Callable[[Any], bool]:
+    """Return what tells whether a value is of a type and within its limits.
+
+    Types are taken apart here, once for a class: doing it again for each value took most of a configuration's loading.
+
+    Args:
+        hint: the type.
+        finite: forbids infinite and undefined numbers.
+    """
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin is Annotated:
         limits = [extra for extra in arguments[1:] if isinstance(extra, Limit)]
-        finite = finite and all(limit.finite for limit in limits)
-        return _fits(arguments[0], value, finite=finite) and all(limit.holds(value) for limit in limits)
+        kind = _check(arguments[0], finite=finite and all(limit.finite for limit in limits))
+        return lambda value: kind(value) and all(limit.holds(value) for limit in limits)
     if origin in (typing.Union, types.UnionType):
-        return any(_fits(member, value) for member in arguments)
+        members = [_check(member) for member in arguments]
+        return lambda value: any(fits(value) for fits in members)
     if origin is typing.Literal:
-        return any(value == member and type(value) is type(member) for member in arguments)
+        return lambda value: any(value == member and type(value) is type(member) for member in arguments)
     if origin is tuple:
-        if not isinstance(value, tuple):
-            return False
-        members = [arguments[0]] * len(value) if arguments[1:] == (Ellipsis,) else arguments
-        pairs = zip(members, value, strict=False)
-        return len(members) == len(value) and all(_fits(member, item, finite=finite) for member, item in pairs)
+        return _check_tuple(arguments, finite=finite)
     if hint is float:
-        if not isinstance(value, int | float) or isinstance(value, bool):
-            return False
-        return abs(value) <= sys.float_info.max or (not finite and isinstance(value, float))
+        return _is_finite if finite else _is_real
     if hint is int:
-        return isinstance(value, int) and not isinstance(value, bool)
+        return lambda value: isinstance(value, int) and not isinstance(value, bool)
     if hint is Any or not isinstance(hint, type) or getattr(hint, "_is_protocol", False):
-        return True
-    return isinstance(value, hint)
+        return lambda value: True
+    return lambda value: isinstance(value, hint)
+
+
+def _check_tuple(arguments: tuple[Any, ...], *, finite: bool) -> Callable[[Any], bool]:
+    if arguments[1:] == (Ellipsis,):
+        item_fits = _check(arguments[0], finite=finite)
+        return lambda value: isinstance(value, tuple) and all(item_fits(item) for item in value)
+    members = [_check(member, finite=finite) for member in arguments]
+
+    def fits(value: Any) -> bool:
+        if not isinstance(value, tuple) or len(value) != len(members):
+            return False
+        return all(item_fits(item) for item_fits, item in zip(members, value, strict=True))
+
+    return fits
+
+
+def _is_finite(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
+
+
+def _is_real(value: Any) -> bool:
+    return _is_finite(value) or isinstance(value, float)
 
 
 _WORDS = {float: "a finite number", int: "a whole number", str: "text", bool: "True or False", type(None): "None"}

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from tflane_jax.ablations.declaration import Claim, Declaration
-from tflane_jax.config import load_config
+from tflane_jax.config import load_config, loaded_once
 from tflane_jax.config_files import split_reference
 from tflane_jax.config_overrides import apply_overrides
 from tflane_jax.errors import UserError
@@ -33,10 +33,11 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> int:
         raise UserError(f"--jobs {options.jobs}: at least one training runs at a time")
     check_folder(options.out)
     configure_jax()
-    configs = {
-        name: apply_overrides(load_config(reference), [*overrides, *settings])
-        for name, (reference, settings) in references.items()
-    }
+    with loaded_once():
+        configs = {
+            name: apply_overrides(load_config(reference), [*overrides, *settings])
+            for name, (reference, settings) in references.items()
+        }
     compare(
         configs,
         options.seeds,

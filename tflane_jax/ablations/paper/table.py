@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from tflane_jax.ablations.declaration import Claim, Declaration
-from tflane_jax.config import RunConfig, load_config, with_step_counts
+from tflane_jax.config import RunConfig, load_config, loaded_once, with_step_counts
 from tflane_jax.config_overrides import apply_overrides
 
 
@@ -147,8 +147,10 @@ class PaperTable:
             quick: with few updates on few data.
         """
         found = {}
+        with loaded_once():
+            loaded = {row.name: load_config(row.config) for row in rows}
         for row in rows:
-            config = load_config(row.config)
+            config = loaded[row.name]
             if self.steps is not None:
                 config = replace(config, training=replace(config.training, steps=self.steps))
             if row.settings:

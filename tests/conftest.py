@@ -2,6 +2,7 @@
 
 import atexit
 import contextlib
+import functools
 import gc
 import os
 import shutil
@@ -21,6 +22,7 @@ import jax  # noqa: E402
 import pytest  # noqa: E402
 from hypothesis import settings  # noqa: E402
 
+from tflane_jax.training import provenance  # noqa: E402
 from tflane_jax.training.runtime import configure_jax  # noqa: E402
 
 configure_jax(keep_programs=False)
@@ -39,6 +41,8 @@ jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
 jax.devices()
 # No test survives a power failure: waiting for the device at every file costs a tenth of the tests that write.
 os.fsync = lambda handle: None
+# The code stays as it is while its tests run: git is asked once, not whenever a run starts.
+provenance._git = functools.cache(provenance._git)
 # Tracing makes millions of objects and hardly any garbage: collecting at the default rate costs a tenth of the time.
 gc.set_threshold(100_000, 50, 100)
 # Every run draws the same examples, on machines of any speed; files say how many.

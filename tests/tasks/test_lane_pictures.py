@@ -1,6 +1,6 @@
 """Pictures of a comparison: which frames and lanes they show, and what they say about them."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import jax.numpy as jnp
@@ -251,16 +251,17 @@ def test_titles_have_room_for_the_ids_of_logs(scene, title):
     assert titles(OneFrame(FakeConfig()), [0]) == [title]
 
 
-def test_stages_tell_the_prediction_for_pictures_from_that_for_scores(drawn, monkeypatch, tmp_path):
-    """Regression: a training showed "compiling the prediction" twice."""
+def test_the_program_that_scores_predicts_for_pictures(drawn, monkeypatch, tmp_path):
+    """Regression: a training showed "compiling the prediction" twice; later it compiled two programs in fact."""
     monkeypatch.setattr("tflane_jax.evaluation.predict._compiled", set())
-    both, told = {"one": model(1, 5), "two": model(-1, 9)}, []
+    both, told = {"one": replace(model(1, 5), batch_size=5), "two": replace(model(-1, 9), batch_size=5)}, []
     task, params = both["one"].task, both["one"].params
+    config = EvaluationConfig(batch_size=5, pictures=2)
     with showing(told.append):
-        task.evaluate(params, task.load(ProceduralConfig()), EvaluationConfig(batch_size=5))
-        task.drawing(WorldData(), EvaluationConfig(pictures=2))(tmp_path, 1, params)
+        task.evaluate(params, task.load(ProceduralConfig()), config)
+        task.drawing(WorldData(), config)(tmp_path, 1, params)
         drawn(both)
+        drawn({"other": model(1, 5), "two": both["two"]})
     compiling = [name for name in told if name.startswith("compiling")]
-    assert compiling[:2] == ["compiling the prediction for scores", "compiling the prediction for pictures"]
-    assert set(compiling[2:]) == {"compiling the prediction for pictures"}
+    assert compiling == ["compiling the prediction for scores", "compiling the prediction for pictures"]
     assert len(list((tmp_path / "pictures").glob("*.png"))) == 1

@@ -94,11 +94,13 @@ def test_evaluation_streams_through_scenes(params, batch_size):
 
 
 @pytest.mark.slow
-def test_single_frames_of_a_stream_are_drawn_with_memory(params):
+@pytest.mark.parametrize("batch_size", [None, 4])
+def test_single_frames_of_a_stream_are_drawn_with_memory(params, batch_size):
     frames = scenes()
     each = [jax.tree.map(lambda leaf, i=i: leaf[i], frames) for i in range(6)]
     (found,) = [answer.centerlines.points for _, answer in predictions(CLIPS, params, frames, 6)]
-    examples, answer = predict_examples(CLIPS, params, SimpleNamespace(example=each.__getitem__), [5, 1, 3])
+    dataset, parts = SimpleNamespace(example=each.__getitem__), CLIPS.parts if batch_size else ()
+    examples, answer = predict_examples(CLIPS, params, dataset, [5, 1, 3], batch_size=batch_size, parts=parts)
     np.testing.assert_array_equal(answer.centerlines.points, found[[5, 1, 3]])
     np.testing.assert_array_equal(examples.bev, frames.bev[[5, 1, 3]])
     assert answer.elements is None

@@ -249,7 +249,7 @@ def _draw(plan: Plan, failures: Sequence[Failure], out: Path) -> None:
             job = plan.of(row, log)[0]
             if job.folder not in failed:
                 run = open_run(job.folder, "last")
-                models[row] = Model(run.config.task, run.params[0])
+                models[row] = Model(run.config.task, run.params[0], run.config.evaluation.batch_size)
         if models:
             pair = [row for row in _DRAWN if row in models][:2] or list(models)
             first = on_log(plan.of(next(iter(models)), log)[0].config, log)

@@ -90,7 +90,7 @@ def first_models(trained: Mapping[str, Sequence[Job]], results: Results) -> dict
             except UserError:
                 print(f"{name} is not drawn: the parameters in {job.folder / 'checkpoints'} are missing or damaged")
                 continue
-            models[name] = Model(run.config.task, run.params[0])
+            models[name] = Model(run.config.task, run.params[0], run.config.evaluation.batch_size)
     return models
 
 

@@ -38,7 +38,7 @@ def predict_split(trained: Run, options: argparse.Namespace) -> int:
         raise UserError(f"nothing to predict: {len(dataset)} images, --count {options.count}")
     indices = spread(len(dataset), options.count)
     examples = stack_examples([dataset.example(index) for index in indices])
-    answers = predict_curves(trained.config.task, trained.params[0], examples, at_once=16)
+    answers = predict_curves(trained.config.task, trained.params[0], examples, at_once=min(16, len(examples.image)))
     make_folder(options.out)
     predictions, truths = [], []
     for i, index in enumerate(indices):

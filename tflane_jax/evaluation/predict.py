@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from typing import Any, Protocol
 
 import jax
@@ -14,6 +14,7 @@ from jax.sharding import Mesh
 
 from tflane_jax.datasets.base import Dataset
 from tflane_jax.datasets.batches import ordered_batches
+from tflane_jax.datasets.loading import keep
 from tflane_jax.devices import divided, everywhere, prediction_mesh, replicated, share
 from tflane_jax.models.parameters import Params
 from tflane_jax.processes import all_rows
@@ -22,7 +23,7 @@ from tflane_jax.startup import compiled
 
 # Examples of one call of `predict_examples`: a model needs memory for the activations of all of them.
 _AT_ONCE = 16
-# What a stage of compiling is for: a training scores batches and draws a few examples, by two programs.
+# What a stage of compiling is for. One program does both in a training and a comparison, and is compiled for scores.
 PREDICTION = "the prediction"
 FOR_SCORES, FOR_PICTURES = f"{PREDICTION} for scores", f"{PREDICTION} for pictures"
 
@@ -129,25 +130,47 @@ _compiled: set[Any] = set()
 
 
 def predict_examples(
-    task: Predictor, params: Params, dataset: Dataset, indices: Sequence[int], *, what: str = PREDICTION
+    task: Predictor,
+    params: Params,
+    dataset: Dataset,
+    indices: Sequence[int],
+    *,
+    batch_size: int | None = None,
+    parts: Collection[str] = (),
+    what: str = PREDICTION,
 ) -> tuple[Example, Prediction]:
     """Return some examples with all their fields, and the predictions for them; both stacked, numpy.
 
-    A model with memory first processes the earlier frames of each example's scene. `what` as of `predictions`.
+    A model with memory first processes the earlier frames of each example's scene. With the batch size and the parts of
+    an evaluation, the program is that of the evaluation, and not compiled again.
+
+    Args:
+        task, params: the model.
+        dataset, indices: the examples.
+        batch_size: examples per call, or frames of a scene; None: up to 16, or one.
+        parts: fields of `Example` that the model sees, see `Task.parts`; none for all.
+        what: see `predictions`.
     """
     examples = stack_examples([dataset.example(index) for index in indices])
+    predicted = functools.partial(_predicted, task, params, batch_size=batch_size, parts=parts, what=what)
     if task.streams:
-        every = [_streamed(task, params, dataset, index, what) for index in indices]
-    else:
-        size = min(len(indices), _AT_ONCE)
-        every = [answer for _, answer in predictions(task, params, examples, size, what=what)]
-    return examples, jax.tree.map(lambda *leaves: np.concatenate(leaves), *every)
+        every = [jax.tree.map(lambda leaf: leaf[-1:], predicted(_frames_until(dataset, index))) for index in indices]
+        return examples, jax.tree.map(lambda *leaves: np.concatenate(leaves), *every)
+    return examples, predicted(examples)
 
 
-def _streamed(task: Predictor, params: Params, dataset: Dataset, index: int, what: str) -> Prediction:
-    """Return the prediction for one example (leading axis 1), after the earlier frames of its scene."""
+def _predicted(
+    task: Predictor, params: Params, examples: Example, *, batch_size: int | None, parts: Collection[str], what: str
+) -> Prediction:
+    size = batch_size or (1 if task.streams else min(len(examples.has_previous), _AT_ONCE))
+    seen = keep(examples, parts) if parts else examples
+    every = [answer for _, answer in predictions(task, params, seen, size, what=what)]
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *every)
+
+
+def _frames_until(dataset: Dataset, index: int) -> Example:
+    """Return the frames of an example's scene up to it, stacked."""
     frames = [dataset.example(index)]
     while frames[0].has_previous:
         frames.insert(0, dataset.example(index - len(frames)))
-    *_, (_, answer) = predictions(task, params, stack_examples(frames), 1, what=what)
-    return answer
+    return stack_examples(frames)

@@ -44,10 +44,12 @@ class Model:
     Attributes:
         task: model and losses.
         params: parameters of one seed.
+        batch_size: of its evaluation, whose compiled program also predicts what is drawn.
     """
 
     task: AnyTask
     params: Params
+    batch_size: int = 16
 
 
 @dataclass(frozen=True)

@@ -262,7 +262,8 @@ class LaneGraphTask(Task[Example, Example | Streamed, LaneGraphSource, HostMemor
 
         def draw(folder: Path, step: int, params: Params) -> None:
             if indices:
-                draw_examples(Model(self, params), source, dataset, indices, folder / "pictures", step)
+                model = Model(self, params, config.batch_size)
+                draw_examples(model, source, dataset, indices, folder / "pictures", step)
 
         return draw
 

@@ -61,7 +61,7 @@ def draw_examples(
     """Write pictures of some examples to a folder, from above and, where there are any, in their camera images."""
     from tflane_jax.plots import save_camera_views, save_examples
 
-    examples, answer = predict_examples(model.task, model.params, dataset, indices, what=FOR_PICTURES)
+    examples, answer = _predicted(model, dataset, indices)
     found = lanes_of(answer)
     path, names = folder / f"step_{step:08d}.png", titles(dataset, indices)
     ground, view = source.example.ground, source.example.range
@@ -69,6 +69,12 @@ def draw_examples(
     if examples.cameras is not None:
         path = path.with_stem(f"{path.stem}_cameras")
         save_camera_views(path, examples, found, answer.elements, titles=names, ground=ground, view=view)
+
+
+def _predicted(model: Model, dataset: Dataset, indices: Sequence[int]) -> tuple[Example, Prediction]:
+    """Return some examples and the predictions for them, by the program of the model's evaluation."""
+    task, size = model.task, model.batch_size
+    return predict_examples(task, model.params, dataset, indices, batch_size=size, parts=task.parts, what=FOR_PICTURES)
 
 
 def draw_hidden_lanes(
@@ -86,10 +92,7 @@ def draw_hidden_lanes(
         hidden = (lanes.valid & _occluded(lanes)).sum(-1)
         indices = np.argsort(-hidden, kind="stable")[:_FRAMES_OF_ONE_MODEL].tolist()
     examples = stack_examples([dataset.example(index) for index in indices])
-    found = {
-        name: lanes_of(predict_examples(model.task, model.params, dataset, indices, what=FOR_PICTURES)[1])
-        for name, model in models.items()
-    }
+    found = {name: lanes_of(_predicted(model, dataset, indices)[1]) for name, model in models.items()}
     ground, view = source.example.ground, source.example.range
     return save_examples(path, examples, found, titles=titles(dataset, indices), ground=ground, view=view)
 
@@ -184,7 +187,9 @@ def _caption(answers: Mapping[str, _Answers], ahead: Mapping[str, Sequence[int]]
 def _answers(model: Model, data: Example | Streamed, field: Field) -> _Answers:
     """Return what a model predicts for a whole split."""
     confidences, valid, lanes, scores = [], [], [], []
-    for indices, batch, answer in predicted_batches(model.task, model.params, data, _BATCH, what=FOR_PICTURES):
+    for indices, batch, answer in predicted_batches(
+        model.task, model.params, data, model.batch_size, what=FOR_PICTURES
+    ):
         lanes.append(lanes_of(answer))
         scores.append(lane_scores(lanes[-1]))
         for row in range(len(indices)):

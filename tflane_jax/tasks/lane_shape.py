@@ -200,7 +200,7 @@ class LaneShapeTask(Task[RoadImage, LabelledImages, ImageSource, None]):
 
         def draw(folder: Path, step: int, params: Params) -> None:
             if examples is not None:
-                answer = predict_curves(self, params, examples, what=FOR_PICTURES)
+                answer = predict_curves(self, params, examples, at_once=config.batch_size, what=FOR_PICTURES)
                 save_road_images(folder / "pictures" / f"step_{step:08d}.png", examples, {f"step {step}": answer})
 
         return draw
@@ -214,7 +214,7 @@ class LaneShapeTask(Task[RoadImage, LabelledImages, ImageSource, None]):
         examples = chosen_examples(data.images, spread(count(data.images), _COMPARED_EXAMPLES))
         save_edge_types(models, examples, path.with_name("edge_types"))
         answers = {
-            name: predict_curves(model.task, model.params, examples, what=FOR_PICTURES)
+            name: predict_curves(model.task, model.params, examples, at_once=model.batch_size, what=FOR_PICTURES)
             for name, model in models.items()
         }
         return save_road_images(path, examples, answers)
@@ -258,11 +258,12 @@ def predict_curves(
     Args:
         task, params: the model.
         examples: B of them, stacked.
-        at_once: images of one call of the model, which needs memory for the activations of all; None: B.
+        at_once: images of one call of the model, which needs memory for the activations of all; None: B. With the
+            batch size of an evaluation, its compiled program is used.
         what: see `evaluation.predict.predictions`.
     """
-    size = min(len(examples.image), at_once or len(examples.image))
-    every = [answer for _, answer in predictions(task, params, examples, size, what=what)]
+    at_once = at_once or len(examples.image)
+    every = [answer for _, answer in predictions(task, params, examples, at_once, what=what)]
     answer = jax.tree.map(lambda *leaves: np.concatenate(leaves), *every)
     if answer.curves is None:
         raise ValueError("this task predicts no lane shapes")

@@ -188,12 +188,13 @@ def test_weights_are_found_under_known_names(tmp_path):
         ({"model": weights, "step": of(np.float32(1))}, "model"),
         ({"model": {"state_dict": weights}}, "model/state_dict"),
         ({"whatever": weights}, "whatever"),
-        ({"model": weights, "ema": weights}, "model"),
+        ({"model": weights, "ema": dict(weights)}, "model"),
     ]:
         found = read_checkpoint(write_zip(tmp_path / "w.pth", tree))
         assert (found.entry, list(found.tensors)) == (entry, ["a"])
+        assert found.alternatives == (("ema",) if "ema" in tree else ())
     path = write_zip(tmp_path / "w.pth", {"depth": {"b": of(GRID)}, "pose": weights})
-    with pytest.raises(UserError, match=r"w\.pth: several sets of tensors.* `entry`, one of: depth, pose"):
+    with pytest.raises(UserError, match=r"w\.pth: several sets of tensors.* --entry\), one of: depth, pose"):
         read_state_dict(path)
     assert list(read_state_dict(path, "pose")) == ["a"]
     for nothing, described in [

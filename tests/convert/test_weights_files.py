@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from tests.convert.lstr_state import TINY, lstr_state
+from tests.convert.torch_files import of, write_zip
 from tests.shared import shared_path
 from tflane_jax.commands.convert import convert
 from tflane_jax.config import load_config
@@ -53,6 +54,19 @@ def test_the_variable_may_name_the_file(folders, monkeypatch):
     file.touch()
     monkeypatch.setenv("TFLANE_WEIGHTS", str(file))
     assert find_weights(Path("lstr")) == (file, LSTR)
+
+
+def test_an_average_beside_the_weights_is_named_and_can_be_taken(tmp_path):
+    kinds = {"state_dict": lstr_state(0), "state_dict_ema": lstr_state(1)}
+    of_file = {name: {key: of(tensor) for key, tensor in state.items()} for name, state in kinds.items()}
+    path = write_zip(tmp_path / "w.pth", of_file | {"optimizer": {"state": {"exp_avg": of(np.ones(3, np.float32))}}})
+    params, table = load_lstr(path, TINY)
+    told = "not read: state_dict_ema has tensors of the same names (--entry state_dict_ema)"
+    assert [row["becomes"] for row in table if row["becomes"].startswith("not read")] == [told]
+    averaged, table = load_lstr(path, TINY, entry="state_dict_ema")
+    assert not [row for row in table if row["becomes"].startswith("not read")]
+    for entry, found in zip(kinds, (params, averaged), strict=True):
+        np.testing.assert_array_equal(found["queries"], kinds[entry]["query_embed.weight"])
 
 
 def test_paths_are_paths(folders):

@@ -28,7 +28,7 @@ _TABLE = "conversion"
 def run(options: argparse.Namespace) -> int:
     """Write the run, and a table with the conversion of every tensor."""
     configure_jax()
-    table, title, part = convert(options.config, options.out, options.weights, options.edge_weight)
+    table, title, part = convert(options.config, options.out, options.weights, options.edge_weight, options.entry)
     print(format_table(table, title=title))
     count = sum(row["tensor"] != "-" for row in table)
     print(f"\n{count} tensors; run written to {options.out}, table to {options.out / _TABLE}.md")
@@ -38,7 +38,11 @@ def run(options: argparse.Namespace) -> int:
 
 
 def convert(
-    reference: str, out: Path, weights: Path | None = None, edge_weight: float | None = None
+    reference: str,
+    out: Path,
+    weights: Path | None = None,
+    edge_weight: float | None = None,
+    entry: str | None = None,
 ) -> tuple[list[dict[str, Any]], str, str | None]:
     """Write published weights as a run, with a table of what becomes of every tensor.
 
@@ -47,6 +51,7 @@ def convert(
         out: folder of the run.
         weights: file, or name of published weights; None for those that the configuration names.
         edge_weight: weight of the selected edge types of a GTN encoder; None for the whole.
+        entry: path of the weights in the file, such as "state_dict_ema"; None: found if it is unambiguous.
 
     Returns:
         The table's rows, its title, and which part of the model the run holds (None for all of it).
@@ -61,20 +66,20 @@ def convert(
     if weights is None:
         raise UserError(f"{reference} names no weights: add --weights FILE")
     part = None
-    if isinstance(config.task, LaneGraphTask) and _is_backbone(lane_graph_weights(weights)):
+    if isinstance(config.task, LaneGraphTask) and _is_backbone(lane_graph_weights(weights), entry):
         if edge_weight is not None:
             raise UserError(f"--edge-weight is of GTN encoders: {weights} is a backbone, leave it out")
         part = BACKBONE
-        params, table = load_backbone(weights, config.task.model)
+        params, table = load_backbone(weights, config.task.model, entry)
         save_weights(config, params, out, part=part)
     else:
-        params, table = load_weights(weights, config.task, "fresh", edge_weight)
+        params, table = load_weights(weights, config.task, "fresh", edge_weight, entry)
         save_weights(replace(config, weights=weights), params, out)
     title = f"{weights}: every tensor and what becomes of it"
     save_table(out / _TABLE, table, {"weights": str(weights)}, title=title)
     return table, title, part
 
 
-def _is_backbone(path: Path) -> bool:
-    checkpoint = read_checkpoint(path)
+def _is_backbone(path: Path, entry: str | None) -> bool:
+    checkpoint = read_checkpoint(path, entry)
     return is_backbone(checkpoint.tensors, checkpoint.others)

@@ -48,13 +48,14 @@ def is_backbone(names: Iterable[str], others: Iterable[str] = ()) -> bool:
     return "conv1.weight" in {without_wrappers(name) for name in names} and all(map(_TENSOR.fullmatch, names))
 
 
-def load_backbone(path: Path, model: HostConfig) -> tuple[Params, list[dict[str, str]]]:
+def load_backbone(path: Path, model: HostConfig, entry: str | None = None) -> tuple[Params, list[dict[str, str]]]:
     """Return the parameters and statistics of a host's backbone, and an account of the file's tensors.
 
     Args:
         path: a state dict of torchvision, for example that of `resnet50` (.pth, .pkl, .npz); it is never unpickled as
             Python objects, see `torch_file`.
         model: a host with cameras.
+        entry: path of the weights in the file, see `torch_file.read_checkpoint`.
 
     Raises:
         UserError: the file cannot be read, is no such state dict, or its ResNet has other sizes than the model's.
@@ -64,7 +65,7 @@ def load_backbone(path: Path, model: HostConfig) -> tuple[Params, list[dict[str,
         raise UserError(
             f"{path}: weights of a backbone are for models with cameras: give the model an encoder of those"
         )
-    checkpoint = read_checkpoint(path)
+    checkpoint = read_checkpoint(path, entry)
     state = checkpoint.tensors
     if not is_backbone(state, checkpoint.others):
         raise UserError(f"{path}: its tensors are not those of a torchvision ResNet (conv1.weight, layer1.0...)")
@@ -77,6 +78,7 @@ def load_backbone(path: Path, model: HostConfig) -> tuple[Params, list[dict[str,
         found = convert(kept, rules, "ResNet", frozen=norms)
     check_fits(found.variables, _expected(config), path)
     table = _with_classifier(found, {name: state[name].shape for name in state.keys() - kept.keys()})
+    table += checkpoint.passed_over()
     return found.variables["params"] | {STATISTICS: found.variables["batch_stats"]}, table
 
 

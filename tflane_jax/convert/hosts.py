@@ -98,13 +98,16 @@ def convert_host(state: Mapping[str, AnyArray], model: PublishedHost) -> Convert
     return convert(state, rules, network, frozen=norms)
 
 
-def load_host(path: Path, model: PublishedHost, missing: Missing = "left out") -> tuple[Params, list[dict[str, str]]]:
+def load_host(
+    path: Path, model: PublishedHost, missing: Missing = "left out", entry: str | None = None
+) -> tuple[Params, list[dict[str, str]]]:
     """Return a task's parameters from the reference's checkpoint (.pth, .pkl, .npz), and the account of its tensors.
 
     Args:
         path: the checkpoint.
         model: with cameras.
         missing: what becomes of auxiliary heads that the file does not have.
+        entry: path of the weights in the file, see `torch_file.read_checkpoint`.
 
     Raises:
         UserError: the file cannot be read, or its tensors are not exactly those of the model.
@@ -114,10 +117,11 @@ def load_host(path: Path, model: PublishedHost, missing: Missing = "left out") -
             f"{path}: published weights are those of models with cameras: give the model an encoder of cameras"
         )
     with naming(path):
-        checkpoint = read_checkpoint(path)
+        checkpoint = read_checkpoint(path, entry)
         check_types(checkpoint.others, _rules(model)[1])
         converted = convert_host(checkpoint.tensors, model)
-    return fitted(converted, _expected(model), path, missing)
+    params, table = fitted(converted, _expected(model), path, missing)
+    return params, table + checkpoint.passed_over()
 
 
 @functools.lru_cache(maxsize=2)

@@ -101,7 +101,11 @@ def convert_lstr(
 
 
 def load_lstr(
-    path: Path, model: LstrConfig, missing: Missing = "left out", edge_weight: float = 1.0
+    path: Path,
+    model: LstrConfig,
+    missing: Missing = "left out",
+    edge_weight: float = 1.0,
+    entry: str | None = None,
 ) -> tuple[Params, list[dict[str, str]]]:
     """Return a task's parameters from a published checkpoint (.pth, .pkl, .npz), and the account of its tensors.
 
@@ -110,6 +114,7 @@ def load_lstr(
         model: with any encoder.
         missing: what becomes of parameters that the checkpoint does not have: auxiliary heads, the scores of a HAN.
         edge_weight: of the edge types that a GTN encoder selects, above 0 and at most 1.
+        entry: path of the weights in the file, see `torch_file.read_checkpoint`.
 
     Raises:
         UserError: the file cannot be read, its tensors are not exactly those of the model, or the encoder has other
@@ -124,11 +129,12 @@ def load_lstr(
             f"{path} is of a transformer, and this encoder has parameters that it lacks: write a run by tflane convert"
         )
     with naming(path):
-        checkpoint = read_checkpoint(path)
+        checkpoint = read_checkpoint(path, entry)
         check_types(checkpoint.others, _PUBLISHED)
         check_digest(checkpoint.tensors, path, published)
         converted = convert_lstr(checkpoint.tensors, model.encoder, edge_weight)
-    return fitted(converted, _expected(model), path, missing, unmapped)
+    params, table = fitted(converted, _expected(model), path, missing, unmapped)
+    return params, table + checkpoint.passed_over()
 
 
 @functools.lru_cache(maxsize=4)

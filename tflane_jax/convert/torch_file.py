@@ -10,13 +10,14 @@ import functools
 import io
 import reprlib
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
 import numpy as np
 
+from tflane_jax.convert.renaming import without_wrappers
 from tflane_jax.convert.torch_pickle import KINDS, Damaged, Tensor, TorchUnpickler, Unreadable, to_array
 from tflane_jax.errors import UserError
 from tflane_jax.files.npz import HoldsObjects, npz_arrays
@@ -41,11 +42,21 @@ class Checkpoint:
         tensors: by name, in the order of the file; floats of fewer than 32 bits as float32.
         entry: path of the tensors in the file, such as "state_dict"; "" is the top level.
         others: what the names beside the tensors hold that are not tensors: counters, settings.
+        alternatives: where no entry was asked for, paths of other sets with tensors of the same names, such as an
+            average of the weights.
     """
 
     tensors: dict[str, np.ndarray]
     entry: str
     others: dict[str, str]
+    alternatives: tuple[str, ...]
+
+    def passed_over(self) -> list[dict[str, str]]:
+        """Return rows of a conversion's table that name the alternatives."""
+        return [
+            {"tensor": "-", "shape": "-", "becomes": f"not read: {name} has tensors of the same names (--entry {name})"}
+            for name in self.alternatives
+        ]
 
 
 def read_state_dict(path: Path, entry: str | None = None) -> dict[str, np.ndarray]:
@@ -211,7 +222,9 @@ def _state_dict(contents: _Contents, entry: str | None, size: int) -> Checkpoint
         if not found:
             raise UserError(f"no tensors by name{_within(entry)}, only {_described(tree)}. Save model.state_dict()")
         listed = ", ".join(sorted(map(_shown, found))[:10])
-        raise UserError(f"several sets of tensors{_within(entry)}. Say which is meant as `entry`, one of: {listed}")
+        raise UserError(
+            f"several sets of tensors{_within(entry)}. Say which is meant (tflane convert --entry), one of: {listed}"
+        )
     (place,) = found
     named, _ = _descend(contents.tree, place)
     tensors, others = {}, {}
@@ -227,7 +240,32 @@ def _state_dict(contents: _Contents, entry: str | None, size: int) -> Checkpoint
             except Damaged as error:
                 raise Damaged(f"{_shown((*place, name))}: {error}") from None
             most -= tensors[name].size
-    return Checkpoint(tensors, "/".join(place), others)
+    alternatives = () if entry else _alternatives(contents.tree, place, tensors)
+    return Checkpoint(tensors, "/".join(place), others, alternatives)
+
+
+def _alternatives(tree: Any, chosen: tuple[str, ...], names: Collection[str]) -> tuple[str, ...]:
+    """Return the paths of all dicts but the chosen one in which tensors have some of its names."""
+    known = {without_wrappers(name) for name in names}
+    places = [place for place in _places(tree, (), set()) if place != chosen]
+    named = {place: _descend(tree, place)[0] for place in places}
+    return tuple(
+        _shown(place)
+        for place, inside in named.items()
+        if any(isinstance(name, str) and without_wrappers(name) in known for name in dict.keys(inside))
+    )
+
+
+def _places(tree: Any, place: tuple[str, ...], seen: set[int]) -> Iterator[tuple[str, ...]]:
+    """Yield the paths of all dicts that hold tensors."""
+    if not isinstance(tree, dict) or id(tree) in seen:
+        return
+    seen.add(id(tree))
+    if any(isinstance(name, str) and _is_tensor(value) for name, value in dict.items(tree)):
+        yield place
+    for name, value in dict.items(tree):
+        if isinstance(name, str):
+            yield from _places(value, (*place, name), seen)
 
 
 def _find(tree: Any, place: tuple[str, ...], seen: set[int]) -> list[tuple[str, ...]]:

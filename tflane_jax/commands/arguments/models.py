@@ -152,6 +152,11 @@ def convert(commands) -> None:
         help="checkpoint, .pth, .pkl or .npz (default: that of the config)",
     )
     parser.add_argument(
+        "--entry",
+        metavar="NAME",
+        help="where the weights are in the checkpoint, such as state_dict_ema (default: where they usually are)",
+    )
+    parser.add_argument(
         "--edge-weight",
         metavar="FRACTION",
         type=float,

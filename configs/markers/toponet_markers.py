@@ -1,12 +1,12 @@
 """TopoNet with fiducial markers (Wu and Hu), and the other rows of the paper's Tables I to IV, on clips.
 
-    tflane tables markers.1 --seeds 4 --jobs 2 --cores 1
+    tflane tables markers.1 --jobs 2 --cores 1
 
 Every row starts from the host of `host.py` trained with the same seed and makes the same number of updates, with or
 without a prior. The rows differ only in the prior. A clip has four frames, half a second apart.
 
-DET_l of this table, percent: TopoNet 32.8 ± 0.3, with markers 40.5 ± 0.2, with SMERF 34.1 ± 0.3, BEVFormer-DETR
-19.4 ± 1.6.
+DET_l of seeds 4 to 7 of this table, percent: TopoNet 33.0 ± 0.3, with markers 40.6 ± 0.3, with SMERF 34.0 ± 0.5,
+BEVFormer-DETR 19.4 ± 0.3.
 """
 
 import functools

@@ -148,15 +148,14 @@ class PaperTable:
         """
         found = {}
         with loaded_once():
-            loaded = {row.name: load_config(row.config) for row in rows}
-        for row in rows:
-            config = loaded[row.name]
-            if self.steps is not None:
-                config = replace(config, training=replace(config.training, steps=self.steps))
-            if row.settings:
-                config = apply_overrides(config, row.settings)
-            config = longer(config, self.steps_factor)
-            found[row.name] = shortened(config) if quick else config
+            for row in rows:
+                config = load_config(row.config)
+                if self.steps is not None:
+                    config = replace(config, training=replace(config.training, steps=self.steps))
+                if row.settings:
+                    config = apply_overrides(config, row.settings)
+                config = longer(config, self.steps_factor)
+                found[row.name] = shortened(config) if quick else config
         return found
 
 

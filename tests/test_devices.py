@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 
+import jax
 import numpy as np
 import pytest
 
@@ -12,6 +13,7 @@ from tests.shared import ROOT
 from tests.training.many_devices import BATCH, EVENLY, assignments, host_terms, in_parts, normalised, predicted
 from tests.training.stub_run import run
 from tests.training.test_loop import arrays, timeless
+from tflane_jax.devices import made_on_host
 from tflane_jax.training.checkpoint import Checkpoints
 from tflane_jax.training.vectors import ROW
 
@@ -63,6 +65,20 @@ def test_a_shared_state_gives_the_same_numbers_and_resumes_as_a_whole_one(forced
     assert found.keys() == expected.keys()
     for name, value in expected.items():
         np.testing.assert_allclose(found[name], value, rtol=1e-5, atol=1e-7, err_msg=name)
+
+
+def test_initial_parameters_are_made_on_the_host_and_put_on_the_accelerator(forced):
+    assert forced[1]["beginning"] == {"computed": 0, "lies": [1], "equal": True}
+
+
+def test_without_a_cpu_the_accelerator_makes_them(monkeypatch):
+    def unknown(backend):
+        raise RuntimeError(f"Unknown backend {backend}")
+
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    monkeypatch.setattr(jax, "local_devices", unknown)
+    made = object()
+    assert made_on_host(lambda: made) is made
 
 
 def test_each_device_holds_its_part_of_a_shared_state(forced):

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -86,6 +87,23 @@ def _put(leaf: Any, sharding: NamedSharding | None) -> Any:
         return jax.random.wrap_key_data(_put(jax.random.key_data(leaf), sharding))
     host = np.asarray(gathered(leaf))  # the array may be on all devices
     return jax.device_put(host) if sharding is None else jax.make_array_from_process_local_data(sharding, host)
+
+
+def made_on_host(make: Callable[[], Any]) -> Any:
+    """Return the arrays that a function makes, computed on the host and put on the default device.
+
+    For programs that run once, and whose compiling for an accelerator takes far longer than they do. Where the CPU is
+    the default, or JAX was told not to use it (JAX_PLATFORMS), the function is only called.
+    """
+    if jax.default_backend() == "cpu":
+        return make()
+    try:
+        host = jax.local_devices(backend="cpu")[0]
+    except RuntimeError:
+        return make()
+    with jax.default_device(host):
+        made = make()
+    return jax.tree.map(lambda leaf: _put(leaf, None), made)
 
 
 def spread(leaf: Any, mesh: Mesh) -> jax.Array:

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import pytest
 
 from tests.ablations.test_tables import small
+from tests.slow import with_slow
 from tests.tiny_run import fakes  # noqa: F401 (a fixture that is used by itself)
 from tflane_jax.ablations import workers
 from tflane_jax.ablations.paper.table import TableRow
@@ -25,7 +26,7 @@ def test_all_tables_are_checked_before_the_first_is_trained(tiny, tmp_path, monk
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("together", [False, True])
+@pytest.mark.parametrize("together", with_slow([False, True], quick=[True]))
 def test_tables_of_one_command_are_trained_one_by_one_or_together(tiny, tmp_path, monkeypatch, together):
     """The second table adds one row to two of the first. Together they advance seed by seed."""
     other = TableRow("slow", str(tiny), ("--optim.lr", "0.001"))

@@ -212,7 +212,7 @@ def test_without_valid_cells_the_output_is_zero(name):
         np.testing.assert_array_equal(leaf, jnp.zeros_like(leaf))
 
 
-@every_config
+@pytest.mark.parametrize("name", with_slow(CONFIGS, QUICK[:1]))
 def test_the_place_of_padding_changes_nothing(name):
     """A small map, and the same map anywhere within a padded one: the same memory and the same gradients."""
     features, position, _ = scene(shape=BLOCK)

@@ -108,7 +108,7 @@ def test_padding_may_hold_nan(name):
     assert_same(predict(params, example), predict(params, example.replace(traffic_flow=dirty)))
 
 
-@pytest.mark.parametrize("name", with_slow(WITH_PRIOR, QUICK))
+@pytest.mark.parametrize("name", with_slow(WITH_PRIOR, quick=("traffic",)))
 def test_an_empty_scene_equals_no_traffic_flow(name):
     _, params, predict = fit(name)
     example = make_line_example(4)
@@ -135,7 +135,7 @@ def test_lanes_do_not_depend_on_the_order_of_instances(name):
     assert_same(predict(params, example), predict(params, shuffled))
 
 
-@pytest.mark.parametrize("name", with_slow(MODELS, QUICK))
+@pytest.mark.parametrize("name", with_slow(MODELS, quick=("traffic",)))
 def test_batch_is_a_vmap(name):
     task, params, predict = fit(name)
     examples = [make_line_example(s, instances=s) for s in (0, 3, 9)]

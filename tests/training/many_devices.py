@@ -13,15 +13,17 @@ import signal
 import sys
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from tests.models.cases import WITH_TRAFFIC, make_example
 from tests.parameters import random_params
 from tests.training.stub import LineTask, line_arrays
 from tests.training.stub_run import CONFIG, OPTIM, TASK, run, score
-from tflane_jax.devices import active, divided, everywhere, replicated, training_mesh
+from tflane_jax.devices import active, divided, everywhere, made_on_host, replicated, training_mesh
 from tflane_jax.errors import UserError
 from tflane_jax.evaluation.predict import predictions
 from tflane_jax.layers.batch_norm import BATCH_AXIS, STATISTICS, BatchNorm
@@ -158,6 +160,21 @@ def held() -> dict[str, list]:
     }
 
 
+def beginning() -> dict[str, Any]:
+    """Return where initial parameters are computed and where they lie, if the second device is an accelerator."""
+    optimizer, example = make_optimizer(OPTIM, CONFIG.steps), {"x": line_arrays()["x"][0]}
+    expected = init_states(TASK, optimizer, [0], example)
+    with mock.patch.object(jax, "default_backend", return_value="gpu"), jax.default_device(jax.devices()[1]):
+        computed = made_on_host(lambda: np.asarray(jnp.zeros(3).device.id))
+        found = init_states(TASK, optimizer, [0], example)
+    pairs = zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True)
+    return {
+        "computed": int(computed),
+        "lies": sorted({device.id for leaf in jax.tree.leaves(found) for device in leaf.devices()}),
+        "equal": all((jax.device_get(leaf) == jax.device_get(other)).all() for leaf, other in pairs),
+    }
+
+
 def with_muon() -> list:
     """Return the stub's kernel after an update by Muon, with the state on every device, and shared."""
     muon = dataclasses.replace(OPTIM, optimizer="muon")
@@ -182,6 +199,7 @@ def main() -> None:
         "in parts": in_parts(),
         "norms": {"learned": normalised(), "frozen": normalised(frozen=True)},
         "held": held(),
+        "beginning": beginning(),
         "host": host_terms() if jax.device_count() == 2 else {},  # compiling takes long
         "muon": with_muon() if jax.device_count() == 2 else [],
     }

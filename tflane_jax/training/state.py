@@ -11,7 +11,7 @@ import optax
 from flax import struct
 from jaxtyping import Array, Int
 
-from tflane_jax.devices import gathered
+from tflane_jax.devices import gathered, made_on_host
 from tflane_jax.models.parameters import Params, split_statistics
 from tflane_jax.startup import in_another_thread
 from tflane_jax.training.rng import stream
@@ -86,11 +86,14 @@ def init_states(
     def init(key: jax.Array, example: Any) -> TrainState:
         return init_state(task, optimizer, key, example)
 
-    # Compiled without optimisation, because compiling takes longer than the calls.
-    keys = [jax.random.key(seed) for seed in seeds]
-    lowered = jax.jit(init).lower(keys[0], example)
-    compiled = in_another_thread(lambda: lowered.compile({"xla_backend_optimization_level": "0"}))
-    return [compiled(key, example) for key in keys]
+    def states() -> list[TrainState]:
+        # Compiled without optimisation, because compiling takes longer than the calls.
+        keys = [jax.random.key(seed) for seed in seeds]
+        lowered = jax.jit(init).lower(keys[0], example)
+        compiled = in_another_thread(lambda: lowered.compile({"xla_backend_optimization_level": "0"}))
+        return [compiled(key, example) for key in keys]
+
+    return made_on_host(states)
 
 
 def per_seed(tree: Any, seeds: Sequence[int]) -> list[Any]:

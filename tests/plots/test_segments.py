@@ -141,6 +141,7 @@ def test_the_legend_of_camera_images_names_what_is_drawn():
     assert truth == ["ground out of sight", "lane in sight", "lane partly in sight", "lane out of sight"]
 
 
+@pytest.mark.slow
 def test_pages_show_segments(tmp_path):
     examples = stack_examples([with_segments(np.nan), with_segments()])
     found = stack_examples([fake_segments(0), fake_segments(1)])

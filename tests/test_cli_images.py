@@ -183,6 +183,7 @@ def test_weights_need_a_configuration(trained, capsys):
 
 
 @pytest.mark.golden
+@pytest.mark.slow
 def test_published_weights_on_the_real_frames(tmp_path, capsys):
     """The original's accuracy 0.96562, FP 0.0 and FN 0.025, and its points within half a pixel."""
     lstr = ["--config", "gtn_lane/lstr", "--weights", str(shared_path("data/lstr/LSTR_500000.npz"))]

@@ -1,12 +1,15 @@
 """Notebooks run from top to bottom and draw, their outputs are stored; the example of the README runs."""
 
 import ast
+import functools
 import inspect
 import re
 
+import jax
 import pytest
 
 from tests.shared import ROOT
+from tests.slow import with_slow
 
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 MOST_BYTES = 600_000
@@ -128,10 +131,13 @@ def printed(notebook):
     return "".join(output.get("text", "") for cell in notebook.cells for output in cell.get("outputs", []))
 
 
-def test_the_example_of_the_readme_runs(tmp_path, monkeypatch):
+@pytest.mark.parametrize("how", with_slow(["traced", "compiled"], quick=["traced"]))
+def test_the_example_of_the_readme_runs(tmp_path, monkeypatch, how):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("TFLANE_CACHE", str(tmp_path))
     (code,) = re.findall(r"^```python\n(.*?)^```", (ROOT / "README.md").read_text("utf-8"), re.DOTALL | re.MULTILINE)
-    names: dict = {}
+    names: dict = {"traced": lambda function: functools.partial(jax.eval_shape, function)}
+    if how == "traced":
+        code = code.replace("jax.jit(", "traced(")
     exec(compile(code, "README.md", "exec"), names)
     assert names["lanes"].points.shape == (48, 11, 3)

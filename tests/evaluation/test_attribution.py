@@ -161,6 +161,7 @@ def test_lanes_are_sorted_by_what_both_others_lack(group):
     assert {(gain.baseline, gain.gain) for gain in beside} == {(gain.score, 0.0) for gain in beside}
 
 
+@pytest.mark.slow
 def test_attention_is_a_distribution_over_the_road_users():
     examples = stack_examples([make_example(0), make_example(1), make_example(2, instances=0)])
     params = random_params(TASK.init, make_example())

@@ -93,7 +93,7 @@ def made_on_host(make: Callable[[], Any]) -> Any:
     """Return the arrays that a function makes, computed on the host and put on the default device.
 
     For programs that run once, and whose compiling for an accelerator takes far longer than they do. Where the CPU is
-    the default, or JAX was told not to use it (JAX_PLATFORMS), the function is only called.
+    the default backend, or JAX_PLATFORMS names the accelerator alone, the function is only called.
     """
     if jax.default_backend() == "cpu":
         return make()

@@ -51,8 +51,9 @@ def check_encoder(case):
     compare(case, outputs)
 
 
-@pytest.mark.slow  # SMERF's constructer, which holds this one, is compared by default
-@pytest.mark.parametrize("path", golden_modules("bev_constructer_*"), ids=case_id)
+@pytest.mark.parametrize(
+    "path", with_slow(golden_modules("bev_constructer_*"), quick=["bev_constructer_toponet_prev"]), ids=case_id
+)
 def test_constructer_matches_the_reference(path):
     check_constructer(load_module_case(path))
 

@@ -153,6 +153,19 @@ def test_a_table_half_from_its_record_is_that_of_all_runs(tiny, made, tmp_path, 
     assert {key: run.measured for key, run in now.items()} == {key: run.measured for key, run in whole.runs.items()}
 
 
+@pytest.mark.parametrize("recorded_at", ["2000-01-01T00:00:00+00:00", "2999-01-01T00:00:00+00:00"])
+def test_of_the_declarations_of_record_and_folder_the_earlier_holds(tiny, made, tmp_path, recorded_at):
+    """Runs of one declaration may be trained in several folders, each of which declares it when it begins."""
+    shutil.copytree(made, tmp_path, dirs_exist_ok=True)
+    own = json.loads((tmp_path / "paper.9" / "declaration.json").read_text())
+    in_record = own | {"time": recorded_at, "begun": 7}
+    archive = replace(recorded(made.with_name("results")), declaration=in_record)
+    path = run_table(small(tiny), range(2), tmp_path, archive=archive)
+    assert json.loads(path.with_name("declaration.json").read_text()) == min(own, in_record, key=lambda d: d["time"])
+    told = "when 7 runs had begun already" in json.loads(path.with_name("summary.json").read_text())["declared"]
+    assert told == recorded_at.startswith("2000")
+
+
 def test_recorded_runs_of_another_configuration_are_trained(tiny, made, tmp_path, monkeypatch, capsys):
     *rows, _ = small(tiny).rows
     other = small(tiny, rows=(*rows, TableRow("again", f"{tiny}:faster")))

@@ -11,7 +11,7 @@ from tests.slow import with_slow
 from tests.tiny_run import fakes  # noqa: F401 (a fixture that is used by itself)
 from tflane_jax.ablations import workers
 from tflane_jax.ablations.paper.table import TableRow
-from tflane_jax.cli import main
+from tflane_jax.cli import build_parser, main
 from tflane_jax.errors import UserError
 
 pytestmark = pytest.mark.usefixtures("cheap")
@@ -48,6 +48,33 @@ def test_tables_of_one_command_are_trained_one_by_one_or_together(tiny, tmp_path
     for name in tables:
         rates = json.loads((tmp_path / name / "summary.json").read_text())["rows"]
         assert {row["seeds"] for row in rates} == {2}
+
+
+def test_chosen_seeds_of_a_table_are_an_interim_look_at_it(tiny, tmp_path, monkeypatch, capsys):
+    table = small(tiny, rows=small(tiny).rows[:2], claims=small(tiny).claims[:1], seeds=3)
+    monkeypatch.setattr("tflane_jax.commands.tables.find_table", {"paper.9": table}.get)
+    assert main(["tables", "paper.9", "--seeds", "0,2-2", "--out", str(tmp_path)]) == 0
+    assert "**Interim**: 2 of 3 declared seeds (0, 2)." in (tmp_path / "paper.9" / "effects.md").read_text()
+    assert json.loads((tmp_path / "paper.9" / "summary.json").read_text())["seeds"] == [0, 2]
+    capsys.readouterr()
+    assert main(["tables", "paper.9", "--seeds", "3", "--out", str(tmp_path)]) == 0
+    assert "6 runs, 4 complete" in capsys.readouterr().out
+    assert "Interim" not in (tmp_path / "paper.9" / "effects.md").read_text()
+
+
+@pytest.mark.parametrize(
+    ("text", "seeds"), [("2", [0, 1]), ("2-2", [2]), ("5,0-1,1", [0, 1, 5]), ("0,4-7", [0, 4, 5, 6, 7])]
+)
+def test_seeds_are_a_number_or_a_list(text, seeds):
+    assert list(build_parser().parse_args(["tables", "tf_lane.1", "--seeds", text]).seeds) == seeds
+
+
+@pytest.mark.parametrize("text", ["0", "", "-1", "3-1", "1,", "1-2-3", "x", "²", "0-999999999", "9" * 5000])
+def test_other_seeds_are_refused(text, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(["tables", "tf_lane.1", f"--seeds={text}"])
+    assert ended.value.code == 2
+    assert "argument --seeds: " in capsys.readouterr().err
 
 
 def test_a_table_that_fails_does_not_stop_the_others(tmp_path, monkeypatch, capsys):

@@ -163,11 +163,16 @@ def test_the_page_leaves_out_best_checkpoints_that_repeat_the_last(tmp_path):
     (tmp_path / "x.json").write_text(json.dumps(summary | {"seeds": [0, 2]}))
     written = page(tmp_path)
     assert "1 to 2 seeds (0, 2), 1 updates a run" in written
-    assert "\ntflane tables x --seeds 3 --jobs 2 --cores 1\n" in written
+    assert "\ntflane tables x --seeds 0,2 --jobs 2 --cores 1\n" in written
+    (tmp_path / "x.json").write_text(json.dumps(summary | {"seeds": [3]}))
+    assert "\ntflane tables x --seeds 3-3 --jobs 2 --cores 1\n" in page(tmp_path)
+    # Rows that other tables share may be there with more seeds than the others.
+    (tmp_path / "x.json").write_text(json.dumps(summary | {"seeds": [0, 1], "declared seeds": 2}))
+    assert "**Interim**: 1 to 2 of 2 declared seeds." in page(tmp_path)
     two = {"table": "tf_lane.5", "cores of a run": [1, 2], "seeds": [0, 1]}
     (tmp_path / "tf_lane.5.json").write_text(json.dumps(summary | two))
     written = page(tmp_path)
-    assert "**Interim**: 2 of 5 declared seeds." in written
+    assert "**Interim**: 1 to 2 of 5 declared seeds." in written
     assert "\ntflane tables tf_lane.5 --seeds 2 --jobs 2\n" in written
 
 
@@ -304,7 +309,6 @@ def test_the_command_lists_tables_and_names_mistakes(capsys):
     assert "Updates alone: evaluation and compiling come on top." in listed
     for arguments, message in (
         (["tf_lane1"], "no table tf_lane1: there is tf_lane.1"),
-        (["tf_lane.1", "--seeds", "0"], "--seeds 0: at least one"),
         (["tf_lane.1", "--jobs", "0"], "at least one training"),
         (["tf_lane.1", "--cores", "0"], "--cores 0: at least one"),
         (["tf_lane.1", "--quick", "--record", "docs"], "--quick runs are no results and never recorded"),

@@ -1,7 +1,8 @@
 """What a comparison tests, written down in its folder before the runs.
 
-The file is never changed. It holds the configuration of every row, so that a comparison of other ones needs another
-folder, as does one with another declaration. One that was declared when runs existed already says so in its report.
+The file is never changed, except that an equal, earlier one of the table's record takes its place. It holds the
+configuration of every row, so that a comparison of other ones needs another folder, as does one with another
+declaration. One that was declared when runs existed already says so in its report.
 """
 
 from __future__ import annotations

@@ -99,7 +99,7 @@ def _section(summary: Mapping[str, Any]) -> list[str]:
         "",
         "```",
         # Numbers depend on the cores of a run, which --jobs alone takes from the machine.
-        f"tflane tables {summary['table']} --seeds {1 + max(summary['seeds'])} --jobs 2{_cores_option(summary)}",
+        f"tflane tables {summary['table']} --seeds {_seeds_option(summary)} --jobs 2{_cores_option(summary)}",
         "```",
         "",
         *_wrapped(facts),
@@ -125,18 +125,30 @@ def _section(summary: Mapping[str, Any]) -> list[str]:
 
 def _seeds(summary: Mapping[str, Any]) -> str:
     """Return how many seeds a table has, as a range where rows differ, and which they are if not 0, 1, 2, ..."""
-    seeds = summary["seeds"]
-    most = len(seeds)
-    least = min((row.get("seeds", most) for row in summary["rows"]), default=most)
+    seeds, (least, most) = summary["seeds"], _fewest_and_most(summary)
     number = counted(most, "seed") if least == most else f"{least} to {most} seeds"
     return number if list(seeds) == list(range(most)) else f"{number} ({_listed(seeds)})"
 
 
+def _seeds_option(summary: Mapping[str, Any]) -> str:
+    seeds = summary["seeds"]
+    if list(seeds) == list(range(len(seeds))):
+        return str(len(seeds))
+    return ",".join(map(str, seeds)) if len(seeds) > 1 else f"{seeds[0]}-{seeds[0]}"
+
+
 def _interim(summary: Mapping[str, Any]) -> str:
-    """Return a sentence for a table with fewer seeds than it declares; "" for one with all."""
-    count, table = len(summary["seeds"]), TABLES.get(summary["table"])
-    declared = summary.get("declared seeds", count if table is None else table.seeds)  # earlier summaries have none
-    return f" **Interim**: {count} of {declared} declared seeds." if count < declared else ""
+    """Return a sentence for a table of which a row has fewer seeds than it declares; "" for one with all."""
+    (least, most), table = _fewest_and_most(summary), TABLES.get(summary["table"])
+    declared = summary.get("declared seeds", most if table is None else table.seeds)  # earlier summaries have none
+    count = str(most) if least == most else f"{least} to {most}"
+    return f" **Interim**: {count} of {declared} declared seeds." if least < declared else ""
+
+
+def _fewest_and_most(summary: Mapping[str, Any]) -> tuple[int, int]:
+    """Return how many seeds the rows have that have the fewest, and how many the table has."""
+    most = len(summary["seeds"])
+    return min((row.get("seeds", most) for row in summary["rows"]), default=most), most
 
 
 def _cores_option(summary: Mapping[str, Any]) -> str:

@@ -129,7 +129,7 @@ def begin_table(
     planned = plan_table(table, seeds, out, jobs=jobs, cores=cores, **how)
     plan = planned.jobs
     # Fewer seeds than the table has are an interim look at it.
-    every = range(max(len(seeds), 0 if quick else table.seeds))
+    every = sorted({*seeds, *range(0 if quick else table.seeds)})
     if archive is not None:
         _adopt_declaration(
             archive, folder, lambda trial: declare(table.declaration, plan, planned.declared(), every, trial)
@@ -210,23 +210,25 @@ def finish_table(run: TableRun, failures: Sequence[Failure]) -> Path:
 
 
 def _adopt_declaration(archive: Archive, folder: Path, check_in: Callable[[Path], Declared]) -> None:
-    """Let a table that was recorded keep its declaration, unless the folder has one or it is another one.
+    """Let a table that was recorded keep its declaration, unless it is another one or the folder's is the earlier.
 
     Args:
         archive: of the table.
         folder: of the table.
         check_in: declares the table in a folder; raises UserError if that holds another declaration.
     """
-    if archive.declaration is None or (folder / DECLARATION).exists():
+    if archive.declaration is None:
         return
     with tempfile.TemporaryDirectory() as trial:
         write_json(Path(trial) / DECLARATION, archive.declaration)
         try:
-            check_in(Path(trial))
+            recorded = check_in(Path(trial))
         except UserError:
-            print("the recorded declaration is another one, so that the table is declared anew")
+            if not (folder / DECLARATION).exists():
+                print("the recorded declaration is another one, so that the table is declared anew")
             return
-    write_json(folder / DECLARATION, archive.declaration)
+    if not (folder / DECLARATION).exists() or recorded.time < check_in(folder).time:
+        write_json(folder / DECLARATION, archive.declaration)
 
 
 def _rows(table: PaperTable, results: Results) -> list[dict[str, Any]]:

@@ -37,8 +37,6 @@ def run(options: argparse.Namespace) -> int:
     if twice := [name for name in options.names if options.names.count(name) > 1]:
         raise UserError(f"{twice[0]} is named twice: once is enough")
     chosen = [find_table(name).lengthened(options.steps_factor) for name in options.names]
-    if options.seeds is not None and options.seeds < 1:
-        raise UserError(f"--seeds {options.seeds}: at least one")
     jobs = (2 if options.quick else 1) if options.jobs is None else options.jobs
     if jobs < 1:
         raise UserError(f"--jobs {jobs}: at least one training runs at a time")
@@ -74,7 +72,7 @@ def run(options: argparse.Namespace) -> int:
 
     how: dict[str, Any] = {"jobs": jobs, "cores": options.cores, "quick": options.quick, "finished": options.finished}
     how["scored_by"] = "any code" if options.earlier_scores else "this code"
-    seeds = {table.name: range(options.seeds or (2 if options.quick else table.seeds)) for table in chosen}
+    seeds = {table.name: options.seeds or range(2 if options.quick else table.seeds) for table in chosen}
     archives = {} if options.source is None else find_archives(options.source, [table.name for table in chosen])
     if len(chosen) > 1:  # errors of the last one come before the first one is trained
         for table in chosen:

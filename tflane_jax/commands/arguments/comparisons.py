@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import argparse
+from collections.abc import Sequence
 from pathlib import Path
 
 from tflane_jax.commands.arguments.shared import OVERRIDES, command, stem
@@ -24,6 +26,26 @@ _FILES = """Protocols and their files:
   tusimple, tusimple-lstr
       Both files have one JSON record per line: raw_file, lanes (x at every row, negative without a point), h_samples
       (ground truth) or run_time in ms (predictions). tusimple-lstr allows 20 s per image instead of 200 ms, as LSTR."""
+
+_MOST_SEEDS = 1000
+
+
+def _seeds(text: str) -> Sequence[int]:
+    """Return the seeds of "8", which are 0 to 7, or of a list such as "0,4-7"."""
+    bounds = [part.split("-") for part in text.split(",")]
+    if any(len(ends) > 2 or not all(end.isdecimal() and len(end) < 10 for end in ends) for ends in bounds):
+        raise argparse.ArgumentTypeError(f"{text!r} is neither a number of seeds nor a list of seeds such as 0,4-7")
+    if bounds == [[text]]:
+        seeds: Sequence[int] = range(int(text))
+    else:
+        ranges = [range(int(ends[0]), int(ends[-1]) + 1) for ends in bounds]
+        if sum(map(len, ranges)) <= _MOST_SEEDS:
+            seeds = sorted({seed for each in ranges for seed in each})
+        else:
+            seeds = range(_MOST_SEEDS + 1)
+    if not 1 <= len(seeds) <= _MOST_SEEDS:
+        raise argparse.ArgumentTypeError(f"{text}: at least one, at most {_MOST_SEEDS}")
+    return seeds
 
 
 def compare(commands) -> None:
@@ -87,7 +109,12 @@ def tables(commands) -> None:
         function="run",
     )
     parser.add_argument("names", metavar="TABLE", nargs="*", help="name of a table, such as tf_lane.1")
-    parser.add_argument("--seeds", metavar="N", type=int, help="number of seeds (default: that of the table)")
+    parser.add_argument(
+        "--seeds",
+        metavar="N|LIST",
+        type=_seeds,
+        help="number of seeds (default: that of the table), or which, such as 0,4-7 or 3-3",
+    )
     parser.add_argument(
         "--jobs",
         type=int,

@@ -10,7 +10,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from tests.fast_compile import compile_fast
+from tests.fast_compile import compile_fast, share_contexts
 
 compile_fast()
 
@@ -26,6 +26,7 @@ from tflane_jax.training import provenance  # noqa: E402
 from tflane_jax.training.runtime import configure_jax  # noqa: E402
 
 configure_jax(keep_programs=False)
+share_contexts()
 # Programs that several tests make anew, such as a model's initialisation, are compiled once, in a folder that the
 # workers of a session and the commands that tests start share. JAX writes its files without a lock, and compiles anew
 # where it finds half of one.
@@ -36,7 +37,8 @@ else:
     atexit.register(shutil.rmtree, _programs, ignore_errors=True)
     os.environ["JAX_COMPILATION_CACHE_DIR"] = _programs
 jax.config.update("jax_compilation_cache_dir", _programs)
-jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 # XLA reads its flags when JAX first asks for devices, which must not be inside a test that changes them.
 jax.devices()
 # No test survives a power failure: waiting for the device at every file costs a tenth of the tests that write.

@@ -27,9 +27,9 @@ from tflane_jax.training.runtime import configure_jax  # noqa: E402
 
 configure_jax(keep_programs=False)
 share_contexts()
-# Programs that several tests make anew, such as a model's initialisation, are compiled once, in a folder that the
-# workers of a session and the commands that tests start share. JAX writes its files without a lock, and compiles anew
-# where it finds half of one.
+# Programs that several tests make anew, from a model's initialisation to a single operation, are compiled once, in a
+# folder that the workers of a session and the commands that tests start share. JAX writes its files without a lock, and
+# compiles anew where it finds half of one.
 if "PYTEST_XDIST_WORKER" in os.environ:
     _programs = os.environ["JAX_COMPILATION_CACHE_DIR"]
 else:

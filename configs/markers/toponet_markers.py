@@ -5,8 +5,8 @@
 Every row starts from the host of `host.py` trained with the same seed and makes the same number of updates, with or
 without a prior. The rows differ only in the prior. A clip has four frames, half a second apart.
 
-DET_l of six seeds of this table, percent: TopoNet 32.8 ± 0.6, with markers 40.6 ± 0.4, with SMERF 33.8 ± 0.6,
-BEVFormer-DETR 19.3 ± 0.6.
+DET_l of eight seeds of this table, percent: TopoNet 33.0 ± 0.6, with markers 40.6 ± 0.5, with SMERF 34.0 ± 0.6,
+BEVFormer-DETR 19.3 ± 0.5.
 """
 
 import functools

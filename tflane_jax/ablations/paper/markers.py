@@ -57,7 +57,7 @@ def _table(
     quoted: dict[str, tuple[float, ...]],
     hosts: tuple[TableRow, ...] = (_TOPONET,),
     primary: str = "all/DET_l",
-    minutes: float = 16.0,
+    minutes: float = 17.1,
 ) -> PaperTable:
     numbers = tuple({"model": name} | dict(zip(columns, row, strict=True)) for name, row in quoted.items())
     return PaperTable(
@@ -73,7 +73,7 @@ def _table(
         # Core minutes of runs on evidence beside other work, which decides more than the row does;
         # evaluations take one minute more.
         minutes=minutes,
-        host_minutes=17.3,
+        host_minutes=18.4,
         note=_EVIDENCE_NOTE,
     )
 

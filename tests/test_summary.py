@@ -58,17 +58,17 @@ class _Leaf:
 
 @pytest.mark.slow
 def test_the_marker_papers_full_size():
-    """Markers add tokens and, in each of six encoder layers, an attention with its norm: 4 (256 x 256 + 256) + 512."""
+    """Markers add tokens and, in each of three encoder layers, an attention and its norm: 4 (256 x 256 + 256) + 512."""
     counts = {}
     for name in ("markers/toponet_r50", "markers/toponet_r50:toponet"):
         config = load_config(name)
         assert isinstance(config.task, LaneGraphTask)
         assert isinstance(config.task.model.encoder, CameraEncoderConfig)
-        assert (config.task.model.encoder.bev.layers, config.optim.lr) == (6, 1e-4)
+        assert (config.task.model.encoder.bev.layers, config.optim.lr) == (3, 1e-4)
         learned, _ = split_statistics(
             shapes_of_params(replace(config.task, clip=1), camera_shapes(config.task.model.encoder))
         )
         counts[name] = parameter_counts(learned)
     ours, toponet = counts.values()
-    assert sum(toponet.values()) == 65_283_139
-    assert sum(ours.values()) == 69_977_667 == 65_283_139 + ours["marker_tokens"] + 6 * 263_680
+    assert sum(toponet.values()) == 62_812_675
+    assert sum(ours.values()) == 66_716_163 == 62_812_675 + ours["marker_tokens"] + 3 * 263_680

@@ -224,8 +224,10 @@ class MapTr(Host):
         """
         config, spec, (queries, position, reference) = self.config.decoder, self.config.spec, start
         (lines, points, dim), groups, outputs = queries.shape, self.groups(len(queries)), []
-        together, sizes = same_group(groups), tuple(count * points for count in groups)
-        points_together = None if together is None else jnp.asarray(np.kron(together, np.ones((points, points), bool)))
+        together = points_together = None
+        if (same := same_group(groups)) is not None:
+            together, points_together = jnp.asarray(same), jnp.asarray(np.kron(same, np.ones((points, points), bool)))
+        sizes = tuple(count * points for count in groups)
         for i in range(config.layers):
             placed = point_position(config, i, position, reference)
             spots = reference.reshape(lines * points, 1, -1)
@@ -248,7 +250,7 @@ class MapTr(Host):
         placed: Float[Array, "i p c"],
         reference: Float[Array, "i p d"],
         bev: Float[Array, "h w e"],
-        together: Bool[np.ndarray, "i i"] | None,
+        together: Bool[Array, "i i"] | None,
         deterministic: bool,
     ) -> Float[Array, "i p c"]:
         """Return the queries after a decoder layer: attention among all points, then to the BEV features around each.

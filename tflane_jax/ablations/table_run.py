@@ -219,16 +219,17 @@ def _adopt_declaration(archive: Archive, folder: Path, check_in: Callable[[Path]
     """
     if archive.declaration is None:
         return
+    own = folder / DECLARATION
     with tempfile.TemporaryDirectory() as trial:
         write_json(Path(trial) / DECLARATION, archive.declaration)
         try:
             recorded = check_in(Path(trial))
         except UserError:
-            if not (folder / DECLARATION).exists():
+            if not own.exists():
                 print("the recorded declaration is another one, so that the table is declared anew")
             return
-    if not (folder / DECLARATION).exists() or recorded.time < check_in(folder).time:
-        write_json(folder / DECLARATION, archive.declaration)
+    if not own.exists() or recorded.time < check_in(folder).time:
+        write_json(own, archive.declaration)
 
 
 def _rows(table: PaperTable, results: Results) -> list[dict[str, Any]]:

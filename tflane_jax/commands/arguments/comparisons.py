@@ -35,17 +35,11 @@ def _seeds(text: str) -> Sequence[int]:
     bounds = [part.split("-") for part in text.split(",")]
     if any(len(ends) > 2 or not all(end.isdecimal() and len(end) < 10 for end in ends) for ends in bounds):
         raise argparse.ArgumentTypeError(f"{text!r} is neither a number of seeds nor a list of seeds such as 0,4-7")
-    if bounds == [[text]]:
-        seeds: Sequence[int] = range(int(text))
-    else:
-        ranges = [range(int(ends[0]), int(ends[-1]) + 1) for ends in bounds]
-        if sum(map(len, ranges)) <= _MOST_SEEDS:
-            seeds = sorted({seed for each in ranges for seed in each})
-        else:
-            seeds = range(_MOST_SEEDS + 1)
-    if not 1 <= len(seeds) <= _MOST_SEEDS:
+    listed = [range(int(ends[0]), int(ends[-1]) + 1) for ends in bounds]
+    ranges = [range(int(text))] if bounds == [[text]] else listed
+    if not 1 <= sum(map(len, ranges)) <= _MOST_SEEDS:
         raise argparse.ArgumentTypeError(f"{text}: at least one, at most {_MOST_SEEDS}")
-    return seeds
+    return sorted({seed for each in ranges for seed in each})
 
 
 def compare(commands) -> None:

@@ -159,7 +159,7 @@ def test_the_page_leaves_out_best_checkpoints_that_repeat_the_last(tmp_path):
     assert "Interim" not in written  # of a table of another version, whose seeds are not known
     assert "\ntflane tables x --seeds 1 --jobs 2 --cores 1\n" in written
     (tmp_path / "x.json").write_text(json.dumps(summary | {"declared seeds": 9}))
-    assert "**Interim**: 1 of 9 declared seeds." in page(tmp_path)
+    assert "**Interim**: 1 of 9 declared seeds." in page(tmp_path).replace("\n", " ")
     (tmp_path / "x.json").write_text(json.dumps(summary | {"seeds": [0, 2]}))
     written = page(tmp_path)
     assert "1 to 2 seeds (0, 2), 1 updates a run" in written
@@ -168,12 +168,24 @@ def test_the_page_leaves_out_best_checkpoints_that_repeat_the_last(tmp_path):
     assert "\ntflane tables x --seeds 3-3 --jobs 2 --cores 1\n" in page(tmp_path)
     # Rows that other tables share may be there with more seeds than the others.
     (tmp_path / "x.json").write_text(json.dumps(summary | {"seeds": [0, 1], "declared seeds": 2}))
-    assert "**Interim**: 1 to 2 of 2 declared seeds." in page(tmp_path)
+    assert "**Interim**: 1 to 2 of 2 declared seeds." in page(tmp_path).replace("\n", " ")
     two = {"table": "tf_lane.5", "cores of a run": [1, 2], "seeds": [0, 1]}
     (tmp_path / "tf_lane.5.json").write_text(json.dumps(summary | two))
     written = page(tmp_path)
-    assert "**Interim**: 1 to 2 of 5 declared seeds." in written
+    assert "**Interim**: 1 to 2 of 5 declared seeds." in written.replace("\n", " ")
     assert "\ntflane tables tf_lane.5 --seeds 2 --jobs 2\n" in written
+
+
+def test_a_remark_on_several_tables_stands_on_the_page_once(tmp_path):
+    summary = dict.fromkeys(("title", "protocol", "declared"), "x") | {"seeds": [0], "steps": [1], "rows": []}
+    summary |= {"cores of a run": [1], "commits": [], "devices": [], "core minutes of a run": {"a": 1.0}}
+    summary |= {"findings": [], "quoted": {"rows": []}}
+    notes = {"x1": "Of one core.", "x2": "Of one core.", "x3": "Of two.", "x4": None}
+    for name, note in notes.items():
+        (tmp_path / f"{name}.json").write_text(json.dumps(summary | {"table": name, "note": note}))
+    sections = page(tmp_path).split("\n## ")[1:]
+    remarks = [[text for text in ("Of one", "on x1 holds here", "Of two") if text in section] for section in sections]
+    assert remarks[:4] == [["Of one"], ["on x1 holds here"], ["Of two"], []]
 
 
 def test_the_page_tells_which_rows_made_how_many_updates(tmp_path):

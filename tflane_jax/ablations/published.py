@@ -55,9 +55,12 @@ def page(folder: Path) -> str:
         "([a control](comparisons.md#the-papers-tables)): runs of one configuration before and after it are not the",
         "same.",
     ]
+    remarked: dict[str, str] = {}  # the table that says it first, by remark
     for name in (*TABLES, *sorted(found.keys() - TABLES.keys())):
         if name in found:
-            lines += ["", *_section(found[name])]
+            note = found[name].get("note")  # earlier summaries have none
+            first = remarked.setdefault(note, name) if note else name
+            lines += ["", *_section(found[name], note if first == name else f"The remark on {first} holds here, too.")]
     if missing := [name for name in TABLES if name not in found]:
         lines += [
             "",
@@ -83,14 +86,15 @@ def _updates(steps: Mapping[str, int] | Sequence[int]) -> str:
     return f"{usual} updates a run" + (f" ({'; '.join(others)})" if others else "")
 
 
-def _section(summary: Mapping[str, Any]) -> list[str]:
+def _section(summary: Mapping[str, Any], note: str | None) -> list[str]:
     minutes = summary["core minutes of a run"]
     cores = _listed(summary["cores of a run"])
     rows = _without_repeated(summary["rows"])
     facts = (
         f"{_seeds(summary)}, {_updates(summary['steps'])}, each on {cores} "
         f"core{'' if cores == '1' else 's'} ({_listed(summary['devices'])}); the updates of a run took "
-        f"{_between(minutes.values())} minutes, other work beside it; code {_listed(summary['commits'])}. "
+        f"{_between(minutes.values())} minutes (means of the rows), other work beside it; "
+        f"code {_listed(summary['commits'])}. "
         f"{summary['protocol']}, test split of the built-in world, percent (mean ± std over seeds). "
         f"{summary['declared']}{_interim(summary)}"
     )
@@ -109,7 +113,7 @@ def _section(summary: Mapping[str, Any]) -> list[str]:
     ]
     if len(rows) < len(summary["rows"]):
         lines += ["Best checkpoints that score as the last are left out.", ""]
-    if note := summary.get("note"):  # earlier summaries have none
+    if note:
         lines += [*_wrapped(note), ""]
     for finding in summary["findings"]:
         lines += _wrapped(f"{finding}.", first="- ", rest="  ")

@@ -99,6 +99,20 @@ def test_openlane_timestamps_take_their_own_pose_and_the_nearest_boxes(folder, t
     assert [k.timestamp_ns for k in found] == [k.timestamp_ns for k in moments]
 
 
+def test_a_key_frame_without_a_box_takes_the_time_of_a_pose(folder):
+    """Regression: its time was made from those of its neighbours, at which a real log has no pose."""
+
+    def time(frame):  # as of a lidar, not quite even
+        return (1000 + 100 * frame + frame % 3) * MS
+
+    boxes = [box(frame, "car", "REGULAR_VEHICLE", 10.0) for frame in range(11) if frame not in (5, 6)]
+    write(folder / ANNOTATIONS, [row | {"timestamp_ns": time(row["timestamp_ns"] // MS // 100 - 10)} for row in boxes])
+    write(folder / POSES, [{"timestamp_ns": time(frame), **POSE, "tx_m": frame} for frame in range(11)])
+    log = load_log(folder)
+    assert log.timestamps_ns.tolist() == [time(frame) for frame in range(11)]
+    assert [(k.timestamp_ns, k.track_frame) for k in log.keyframes] == [(time(f), f) for f in (0, 5, 10)]
+
+
 def test_frames_without_a_box_are_frames_of_the_history(folder):
     """The file has no rows of them: frames 2 and 3 of six."""
     write(folder / ANNOTATIONS, [box(frame, "car", "REGULAR_VEHICLE", 10.0) for frame in (0, 1, 4, 5)])

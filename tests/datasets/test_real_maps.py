@@ -24,6 +24,7 @@ from tflane_jax.datasets.sources import source_of
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import invert_pose, project, transform_points
 from tflane_jax.markers.simulation import MarkerConfig
+from tflane_jax.scene import LineType
 from tflane_jax.world.cameras.ring import NUSCENES_RING, CameraRigConfig
 from tflane_jax.world.presets import REAL_MAPS
 from tflane_jax.world.roads.map_roadside import lane_points
@@ -106,6 +107,22 @@ def test_the_cache_key_changes_with_the_content_of_the_maps(maps, tmp_path):
     assert fingerprint(RealMapDataset(config(tmp_path))) == before
     write(path, crossroads_features()[:-1])
     assert fingerprint(RealMapDataset(config(tmp_path))) != before
+
+
+def test_a_map_that_was_edited_meanwhile_is_read_again(tmp_path):
+    """Regression: examples of the old map were kept under the content of the new one."""
+
+    def dashed():
+        segments = RealMapDataset(config(tmp_path)).example(0).segments
+        return (np.stack([segments.left_type, segments.right_type])[:, segments.valid] == LineType.DASHED).sum()
+
+    features = crossroads_features()
+    path = write(tmp_path / "town.geojson", features)
+    assert dashed() > 0
+    for feature in features:
+        feature["properties"] |= {"left": "solid"} if "left" in feature["properties"] else {}
+    write(path, features)
+    assert dashed() == 0
 
 
 @pytest.mark.parametrize(

@@ -148,7 +148,8 @@ def _drive(
         )
     check_interval(annotated, "nanoseconds", str(folder / ANNOTATIONS))
     _poses_at(annotated, pose_times, poses, folder)  # of these the file has the exact ones
-    times = _with_empty_frames(annotated, folder)
+    # Frames without a box have no time of their own: each takes that of a pose, as annotated ones have it.
+    times = np.unique(pose_times[_nearest(pose_times, _with_empty_frames(annotated, folder))])
     moments = annotated if keyframes == "annotations" else times[::_FRAMES_PER_KEYFRAME]
     if keyframes == "openlane_v2" and openlane is not None:
         moments = openlane_timestamps(openlane).get(folder.name, moments)

@@ -71,6 +71,11 @@ def scene_outline(folder: Path, name: str) -> LogOutline:
     return LogOutline(name, "nuscenes", tables.location(scene), key_frames(scene_frames(tables, scene)))
 
 
-@functools.lru_cache(maxsize=4)
 def _expansion(path: Path) -> MapExpansion:
+    state = path.stat() if path.is_file() else None
+    return _kept_expansion(path, state and (state.st_mtime_ns, state.st_size))
+
+
+@functools.lru_cache(maxsize=4)
+def _kept_expansion(path: Path, state: tuple[int, int] | None) -> MapExpansion:
     return read_expansion(path)

@@ -86,7 +86,8 @@ class RealMapDataset(SimulatedDataset):
             )
         super().__init__(config)
         self.maps = tuple(chosen_maps(config.maps, config.logs, config.without))
-        self.config = replace(config, content=tuple(one.content() for one in self.maps))
+        self._content = {one: one.content() for one in self.maps}
+        self.config = replace(config, content=tuple(self._content.values()))
 
     def place(self, scene_id: int) -> MapFile | None:
         """Return the map of a scene; None for generated roads."""
@@ -98,7 +99,8 @@ class RealMapDataset(SimulatedDataset):
         """Return the log of a scene."""
         place = self.place(scene_id)
         world = self.config.generated_world if place is None else self.config.world
-        return _simulated(scene_id, world, self.history(world), place, sees(self.config.example))
+        content = "" if place is None else self._content[place]
+        return _simulated(scene_id, world, self.history(world), place, content, sees(self.config.example))
 
 
 def sees(example: ExampleConfig) -> float:
@@ -107,13 +109,16 @@ def sees(example: ExampleConfig) -> float:
 
 
 @functools.lru_cache(maxsize=64)
-def _read(place: MapFile) -> RoadMap:
+def _read(place: MapFile, content: str) -> RoadMap:
+    """Return the map; `content` is that of its files, so that an edited map is read again."""
     return place.read()
 
 
 @functools.lru_cache(maxsize=4)
-def _simulated(scene_id: int, world: WorldConfig, history: int, place: MapFile | None, metres: float) -> Log:
-    return simulate(scene_id, world, history, None if place is None else Place(_read(place), metres))
+def _simulated(
+    scene_id: int, world: WorldConfig, history: int, place: MapFile | None, content: str, metres: float
+) -> Log:
+    return simulate(scene_id, world, history, None if place is None else Place(_read(place, content), metres))
 
 
 @dataclass(frozen=True)
@@ -187,7 +192,7 @@ def _drives(config: RealMapConfig) -> list[DrivenPath]:
     GeoJSON maps have coordinates of their own, which no recording shares.
     """
     found = chosen_maps(config.maps, config.logs, config.without) if config.generated < 1.0 else []
-    maps = [_read(one) for one in found]
+    maps = [_read(one, one.content()) for one in found]
     return [DrivenPath(one.name, one.area, one.places) for one in maps if one.source != "geojson"]
 
 

@@ -15,7 +15,7 @@ from tflane_jax.ablations.archive import read_archive, write_archive
 from tflane_jax.ablations.declaration import Claim
 from tflane_jax.ablations.paper.table import TableRow
 from tflane_jax.ablations.published import record
-from tflane_jax.ablations.reuse import find_archives, unused
+from tflane_jax.ablations.reuse import FILE, InterimRecord, find_archives, unused
 from tflane_jax.ablations.scores import is_measured
 from tflane_jax.ablations.table_plan import plan_table
 from tflane_jax.ablations.table_run import run_table
@@ -136,6 +136,28 @@ def test_a_table_from_its_record_is_that_of_its_runs(tiny, made, tmp_path, monke
     before = scores.read_bytes()
     record([made / "paper.9" / "summary.json"], results)
     assert scores.read_bytes() == before
+
+
+def test_the_record_of_a_table_in_training_keeps_the_runs_of_others(tiny, made, tmp_path):
+    """Regression: it held the runs of the process that wrote last, or those of the last choice of seeds."""
+    archive, path = recorded(made.with_name("results")), tmp_path / "paper.9" / FILE
+    plan = plan_table(small(tiny), range(2), tmp_path, archive=archive).jobs
+    jobs = {job.recorded.key: job for of_row in plan.values() for job in of_row}
+
+    def process(keys):
+        mine = {row: [job for job in of_row if job.recorded.key in keys] for row, of_row in plan.items()}
+        return InterimRecord(path, "paper.9", archive.declaration, mine, ("all/recall",), ())
+
+    first, *others = jobs
+    one, other = process([first]), process(others)
+    one.add(jobs[first])
+    for key in others:
+        other.add(jobs[key])
+    one.add(jobs[first])
+    assert read_archive(path).runs.keys() == jobs.keys()
+    path.write_bytes(b"damaged")
+    with pytest.raises(UserError, match=FILE):
+        process([first])
 
 
 def test_a_table_half_from_its_record_is_that_of_all_runs(tiny, made, tmp_path, monkeypatch):

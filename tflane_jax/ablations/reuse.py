@@ -15,13 +15,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from tflane_jax.ablations.archive import Archive, read_archive, write_archive
+from tflane_jax.ablations.archive import Archive, merged, read_archive, write_archive
 from tflane_jax.ablations.facts import facts
 from tflane_jax.ablations.jobs import Job
 from tflane_jax.ablations.recorded import Measured, RecordedRun, evaluation_name
 from tflane_jax.ablations.scores import evaluations, is_measured, measure
 from tflane_jax.config_io import first_difference, to_json
 from tflane_jax.errors import UserError
+from tflane_jax.files.locks import take
 from tflane_jax.runs import current_form
 
 FILE = "scores.json.gz"
@@ -187,12 +188,14 @@ class InterimRecord:
     """The record of a table while it is trained: its file is written anew after each run.
 
     Whatever ends the machine, the small file holds all runs that had finished, with their scores. Another machine
-    takes them by `--from`.
+    takes them by `--from`. What the file held before, such as other seeds or runs of another process, stays.
 
     Args:
         path: of the file.
         table, declaration, scores, curves: see `archive_of`.
         plan: trainings of each row; those that are complete and measured enter at once.
+
+    Raises UserError for a file that is there and damaged.
     """
 
     def __init__(
@@ -205,6 +208,7 @@ class InterimRecord:
         curves: Collection[str],
     ) -> None:
         self._path, self._table, self._declaration = path, table, declaration
+        self._there()
         self._kept = scores, curves
         # Of equal rows, the first names the run, as in `archive_of`.
         self._rows = {job.folder: name for name, jobs in reversed([*plan.items()]) for job in jobs}
@@ -214,13 +218,21 @@ class InterimRecord:
     def add(self, job: Job) -> None:
         """Add a finished run, unless it is a host, which is in no row.
 
-        Raises OSError or UserError if the file cannot be written.
+        Raises OSError or UserError if the file cannot be written, or what was there cannot be read.
         """
         if (row := self._rows.get(job.folder)) is None:
             return
         (run,) = archive_of(self._table, self._declaration, {row: [job]}, *self._kept).runs.values()
         self._runs = {**self._runs, run.key: run}
-        write_archive(self._path, Archive(self._table, self._declaration, self._runs))
+        archive = Archive(self._table, self._declaration, self._runs)
+        self._path.parent.mkdir(parents=True, exist_ok=True)
+        with self._path.with_name(f"{self._path.name}.lock").open("w") as lock:  # several processes may train a table
+            take(lock, wait=True)
+            there = self._there()
+            write_archive(self._path, archive if there is None else merged(there, archive))
+
+    def _there(self) -> Archive | None:
+        return read_archive(self._path) if self._path.exists() else None
 
 
 def _recorded(key: str, row: str, job: Job, scores: Collection[str], curves: Collection[str], now: str) -> RecordedRun:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import hashlib
 import importlib
 import importlib.abc
@@ -102,11 +103,30 @@ def imports_of(config: Any) -> str:
     """
     found: dict[str, None] = {}
     for kind in _classes(config):
-        if kind.__module__.partition(".")[0] != __name__.partition(".")[0]:
+        if _is_own(kind):
             module = sys.modules[kind.__module__]
             own_file = kind.__module__.startswith(_PREFIX)
             found[os.path.relpath(str(module.__file__)) if own_file else kind.__module__] = None
     return "".join(f" --import {name}" for name in found)
+
+
+def own_content(config: Any) -> str:
+    """Return the hash of the files that define a configuration's own classes; "" where all are the package's."""
+    modules = sorted({kind.__module__ for kind in _classes(config) if _is_own(kind)})
+    return hashlib.sha256("".join(map(_content, modules)).encode()).hexdigest() if modules else ""
+
+
+@functools.cache
+def _content(module: str) -> str:
+    """Return what tells the code of a module from its other states, of one that is edited later the code that runs."""
+    if module.startswith(_PREFIX):  # its name does
+        return module
+    file = sys.modules[module].__file__
+    return "" if file is None else hashlib.sha256(Path(file).read_bytes()).hexdigest()
+
+
+def _is_own(kind: type) -> bool:
+    return kind.__module__.partition(".")[0] != __name__.partition(".")[0]
 
 
 def _classes(config: Any) -> Iterator[type]:

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import pytest
 
+from tests.datasets.test_road_maps import crossroads_features, write
 from tests.tiny_run import fakes  # noqa: F401 (a fixture that is used by itself)
 from tflane_jax.ablations import workers
 from tflane_jax.ablations.jobs import Job, file_names
@@ -14,10 +15,20 @@ from tflane_jax.ablations.scores import code_digest, measure, with_test_set
 from tflane_jax.cli import main
 from tflane_jax.config import RunConfig, load_config
 from tflane_jax.config_overrides import apply_overrides
+from tflane_jax.datasets.real_maps import RealMapData
 from tflane_jax.errors import UserError
+from tflane_jax.own_modules import import_file
 from tflane_jax.training.records import read_records
 
 QUICK = ["--training.eval-every", "4"]
+OWN_LOSS = """from dataclasses import dataclass
+from tflane_jax.losses.toponet import TopoNetLossConfig
+
+
+@dataclass(frozen=True)
+class OwnLoss(TopoNetLossConfig):
+    own_weight: float = {}
+"""
 
 
 pytestmark = pytest.mark.usefixtures("cheap")
@@ -161,6 +172,26 @@ def test_scores_belong_to_data_and_are_measured_once(tiny, out, monkeypatch):
     monkeypatch.setattr(scores, "code_digest", lambda: "another program")
     measure(job, job.config, "last")
     assert loaded == [3, 200]
+
+
+def test_scores_belong_to_the_files_of_maps_and_of_own_classes(tiny, out, tmp_path, monkeypatch):
+    from tflane_jax.ablations import scores
+
+    job, loaded = job_of(tiny, out / "base" / "seed_0"), []
+    data = scores.load_test_data(job.config)
+    monkeypatch.setattr(scores, "load_test_data", lambda config: loaded.append(config) or data)
+    maps, own = tmp_path / "town.geojson", tmp_path / "own.py"
+    for features in (crossroads_features(), crossroads_features()[:-1]):
+        write(maps, features)
+        for _ in range(2):
+            measure(job, replace(job.config, data=RealMapData(tmp_path)), "last")
+    assert len(loaded) == 2
+    for weight in (0.1, 0.2):
+        own.write_text(OWN_LOSS.format(weight))
+        task = replace(job.config.task, losses=import_file(own).OwnLoss())
+        for _ in range(2):
+            measure(job, replace(job.config, task=task), "last")
+    assert len(loaded) == 4
 
 
 def test_a_run_that_ended_before_its_last_checkpoint_is_not_complete(tiny, out):

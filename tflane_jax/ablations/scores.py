@@ -1,8 +1,9 @@
 """Scores of trained runs on test sets, kept beside each run.
 
-An entry of a file of scores is valid for one checkpoint (its content), one data source, one evaluation setting and one
-state of the program's code. Whatever else is in the file is ignored. Scores by an earlier state of the code count where
-`Job.scored_by` says so. Those of a recorded run are in its record.
+An entry of a file of scores is valid for one checkpoint (its content), one data source, one evaluation setting, and one
+state of the program's code, of the user's own classes, and of the files of maps and logs. Whatever else is in the file
+is ignored. Scores by an earlier state of the code count where `Job.scored_by` says so. Those of a recorded run are in
+its record.
 """
 
 from __future__ import annotations
@@ -22,9 +23,11 @@ from tflane_jax.ablations.recorded import Measured, Which, evaluation_name
 from tflane_jax.config import RunConfig
 from tflane_jax.config_io import to_json
 from tflane_jax.config_overrides import apply_overrides
+from tflane_jax.datasets.sources import source_of
 from tflane_jax.errors import UserError
 from tflane_jax.evaluation.results import SceneRatio, SceneSamples
 from tflane_jax.files.atomic import write_json
+from tflane_jax.own_modules import own_content
 from tflane_jax.runs import load_test_data, open_run
 from tflane_jax.training.checkpoint import Checkpoints
 
@@ -137,11 +140,18 @@ def _checkpoint(job: Job, config: RunConfig, which: Which) -> tuple[int, dict[st
     step = checkpoints.best_step() if which == "best" else checkpoints.find("last")
     if step is None:
         return None
+    source = config.data.source("test")
+    # Left out where there is nothing of the kind: the marks of all other entries stay what they were.
+    further = {
+        "content": job.content,
+        "files": source_of(source).content(source),
+        "own classes": own_content(config),
+    }
     return step, {
         "checkpoint": checkpoints.content(step),
-        "source": repr(config.data.source("test")),
+        "source": repr(source),
         "evaluation": to_json(config.evaluation),
-        **({"content": job.content} if job.content else {}),
+        **{name: content for name, content in further.items() if content},
     }
 
 

@@ -108,6 +108,8 @@ class DataSource(Generic[ConfigT]):
         cameras: config -> names of the cameras whose images are read from files, in order; None for no such images.
         tracks_hz: config -> frames a second of the tracks in its scenes; 0 without tracks, None where that is not known
             without data.
+        content: config -> hash of the files of its examples, so that scores are not taken for those of files that were
+            edited; "" where there are none, or too many to read.
     """
 
     name: str
@@ -132,6 +134,7 @@ class DataSource(Generic[ConfigT]):
     no_drives: str = ""
     cameras: Callable[[ConfigT], tuple[str, ...] | None] = lambda config: None
     tracks_hz: Callable[[ConfigT], float | None] = lambda config: None
+    content: Callable[[ConfigT], str] = lambda config: ""
 
 
 def split_config(config: type[ConfigT], data: Any, **own: Any) -> ConfigT:

@@ -20,7 +20,7 @@ from tflane_jax.datasets.data_source import Choice, DataSource, FolderCheck
 from tflane_jax.datasets.overlap import DrivenPath
 from tflane_jax.datasets.procedural import SimulatedDataset, scene_limits
 from tflane_jax.datasets.recorded_logs import RECORDED_EXAMPLE, RecordedConfig
-from tflane_jax.datasets.road_maps import MapFile, chosen_maps, find_maps
+from tflane_jax.datasets.road_maps import MapFile, chosen_maps, content_of, find_maps
 from tflane_jax.datasets.streaming import StreamingConfig
 from tflane_jax.errors import UserError
 from tflane_jax.limits import Count, Fraction, Rules
@@ -252,4 +252,5 @@ SOURCE = DataSource(
     recorded=False,
     check=check_real_maps,
     tracks_hz=lambda config: config.world.rate_hz,
+    content=lambda config: content_of(chosen_maps(config.maps, config.logs, config.without)),
 )

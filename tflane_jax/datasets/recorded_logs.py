@@ -17,7 +17,7 @@ from tflane_jax.datasets.examples import make_example
 from tflane_jax.datasets.log_frames import LogFrames
 from tflane_jax.datasets.overlap import frame_drives
 from tflane_jax.datasets.procedural import REAL_LIKE_EXAMPLE
-from tflane_jax.datasets.road_maps import MapFile, chosen_maps
+from tflane_jax.datasets.road_maps import MapFile, chosen_maps, content_of
 from tflane_jax.datasets.streaming import StreamingConfig
 from tflane_jax.errors import UserError
 from tflane_jax.scene import Example
@@ -139,6 +139,11 @@ def _choose(choice: Choice) -> RecordedConfig:
     return RecordedConfig(choice.root, logs, without, example=example)
 
 
+def _content(config: RecordedConfig) -> str:
+    giver = chosen_maps(config.root, (config.traffic,)) if config.traffic else []
+    return content_of([*chosen_maps(config.root, config.logs, config.without), *giver])
+
+
 SOURCE = DataSource(
     name="recorded",
     data=RecordedData,
@@ -149,4 +154,5 @@ SOURCE = DataSource(
     title=lambda config: "-".join(("recorded", *config.logs[:1])),
     drives=lambda config: frame_drives(RecordedDataset(config)),
     root="a folder of logs of any known format",
+    content=_content,
 )

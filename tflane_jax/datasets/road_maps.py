@@ -97,6 +97,11 @@ class MapFile:
         return read_lanes(self.files[0]) if not self.recorded else road_map_of(self.log())
 
 
+def content_of(maps: Collection[MapFile]) -> str:
+    """Return the hash of all that several maps depend on, in their order."""
+    return hashlib.sha256("".join(one.content() for one in maps).encode()).hexdigest()
+
+
 @functools.lru_cache(maxsize=4096)
 def _digest(file: Path, size: int, changed_ns: int) -> bytes:
     """Return the hash of a file; many scenes share the tables and the map of a city, which are large."""

@@ -1,0 +1,96 @@
+"""The page of results, made from the summaries of recorded tables."""
+
+import json
+import shutil
+
+from tests.shared import ROOT
+from tflane_jax.ablations.published import page
+from tflane_jax.cli import main
+
+
+def test_the_page_leaves_out_best_checkpoints_that_repeat_the_last(tmp_path):
+    rows = [
+        {"model": model, "checkpoint": which, "seeds": 1, "score": score}
+        for which, scores in (("last", ("1.0", "2.0")), ("best", ("1.0", "2.5")))
+        for model, score in zip("ab", scores, strict=True)
+    ]
+    rows[0]["score, geometric"] = "1.5"
+    summary = dict.fromkeys(("table", "title", "protocol", "declared"), "x") | {
+        "seeds": [0],
+        "steps": [1],
+        "rows": rows,
+    }
+    summary |= {"cores of a run": [1], "commits": [], "devices": [], "core minutes of a run": {"a": 1.0}}
+    summary |= {"findings": [], "quoted": {"rows": []}}
+    (tmp_path / "x.json").write_text(json.dumps(summary))
+    written = page(tmp_path)
+    lines = [line.split() for line in written.splitlines() if line.startswith(("| a", "| b"))]
+    assert [(line[1], line[3]) for line in lines] == [("a", "last"), ("b", "last"), ("b", "best")]
+    assert "Best checkpoints that score as the last are left out.\n" in written
+    assert "1 seed, 1 updates a run" in written
+    assert "Interim" not in written  # of a table of another version, whose seeds are not known
+    assert "\ntflane tables x --seeds 1 --jobs 2 --cores 1\n" in written
+    (tmp_path / "x.json").write_text(json.dumps(summary | {"declared seeds": 9}))
+    assert "**Interim**: 1 of 9 declared seeds." in page(tmp_path).replace("\n", " ")
+    (tmp_path / "x.json").write_text(json.dumps(summary | {"seeds": [0, 2]}))
+    written = page(tmp_path)
+    assert "1 to 2 seeds (0, 2), 1 updates a run" in written
+    assert "\ntflane tables x --seeds 0,2 --jobs 2 --cores 1\n" in written
+    (tmp_path / "x.json").write_text(json.dumps(summary | {"seeds": [3]}))
+    assert "\ntflane tables x --seeds 3-3 --jobs 2 --cores 1\n" in page(tmp_path)
+    # Rows that other tables share may be there with more seeds than the others.
+    (tmp_path / "x.json").write_text(json.dumps(summary | {"seeds": [0, 1], "declared seeds": 2}))
+    assert "**Interim**: 1 to 2 of 2 declared seeds." in page(tmp_path).replace("\n", " ")
+    two = {"table": "tf_lane.5", "cores of a run": [1, 2], "seeds": [0, 1]}
+    (tmp_path / "tf_lane.5.json").write_text(json.dumps(summary | two))
+    written = page(tmp_path)
+    assert "**Interim**: 1 to 2 of 5 declared seeds." in written.replace("\n", " ")
+    assert "\ntflane tables tf_lane.5 --seeds 2 --jobs 2\n" in written
+
+
+def test_a_remark_on_several_tables_stands_on_the_page_once(tmp_path):
+    summary = dict.fromkeys(("title", "protocol", "declared"), "x") | {"seeds": [0], "steps": [1], "rows": []}
+    summary |= {"cores of a run": [1], "commits": [], "devices": [], "core minutes of a run": {"a": 1.0}}
+    summary |= {"findings": [], "quoted": {"rows": []}}
+    notes = {"x1": "Of one core.", "x2": "Of one core.", "x3": "Of two.", "x4": None}
+    for name, note in notes.items():
+        (tmp_path / f"{name}.json").write_text(json.dumps(summary | {"table": name, "note": note}))
+    sections = page(tmp_path).split("\n## ")[1:]
+    remarks = [[text for text in ("Of one", "on x1 holds here", "Of two") if text in section] for section in sections]
+    assert remarks[:4] == [["Of one"], ["on x1 holds here"], ["Of two"], []]
+
+
+def test_the_page_tells_which_rows_made_how_many_updates(tmp_path):
+    """Regression: "2000, 4000 updates a run"."""
+    summary = dict.fromkeys(("table", "title", "protocol", "declared"), "x") | {"seeds": [0], "rows": []}
+    summary |= {"cores of a run": [1], "commits": [], "devices": [], "core minutes of a run": {"a": 1.0}}
+    summary |= {"findings": [], "quoted": {"rows": []}}
+    hosts = {"a": 20, "A host": 40, "b": 20, "B host": 40, "c": 20, "long": 80}
+    told = {
+        "1 seed, 20 updates a run, each on 1 core": {"a": 20, "b": 20},
+        "1 seed, 20 updates a run (40 of A host and B host; 80 of long), each on 1 core": hosts,
+        "1 seed, 20 or 40 updates a run, each on 1 core": [20, 40],  # an earlier summary
+    }
+    for sentence, steps in told.items():
+        (tmp_path / "x.json").write_text(json.dumps(summary | {"steps": steps}))
+        assert sentence in page(tmp_path).replace("\n", " ")
+
+
+def test_no_page_is_made_of_a_folder_without_results(tmp_path, capsys):
+    (tmp_path / "empty").mkdir()
+    assert main(["tables", "--record", str(tmp_path / "empty")]) == 2
+    assert "empty holds no results of tables" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["empty"]
+
+
+def test_the_page_is_written_anew_without_a_table(tmp_path, capsys):
+    folder = tmp_path / "results"
+    folder.mkdir()
+    shutil.copy(ROOT / "docs" / "results" / "markers.3.json", folder)
+    assert main(["tables", "--record", str(folder)]) == 0
+    assert (tmp_path / "results.md").read_text() == page(folder)
+    assert f"written: {tmp_path / 'results.md'}" in capsys.readouterr().out
+
+
+def test_the_page_of_results_is_what_its_summaries_give():
+    assert (ROOT / "docs" / "results.md").read_text() == page(ROOT / "docs" / "results")

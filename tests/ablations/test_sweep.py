@@ -9,10 +9,10 @@ import pytest
 from tests.ablations.test_compare import CONFIG
 from tests.models.cases import BASELINE
 from tests.parameters import random_params
-from tflane_jax.ablations.sweep import runs_below, sweep
+from tflane_jax.ablations.sweep import _tell_unfinished, runs_below, sweep
 from tflane_jax.cli import main
 from tflane_jax.errors import UserError
-from tflane_jax.runs import save_weights
+from tflane_jax.runs import Run, save_weights
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 
 
@@ -50,6 +50,14 @@ def test_every_run_is_evaluated_at_every_value(folder, tmp_path, monkeypatch, ca
         sweep(one, "data.world.severity", ["0"], tmp_path / "again", which="best")
     first = json.loads(again.with_suffix(".json").read_text())["meta"]["scores"]["one"][0][0]
     assert first == content["meta"]["scores"]["one"][0][0]
+
+
+def test_runs_that_are_not_finished_are_named(capsys):
+    """Regression: a seed in the middle of its training entered the mean without a word."""
+    steps = CONFIG.training.steps
+    runs = [Run(f"run {step}", CONFIG, step, ()) for step in (0, steps - 1, steps)]
+    assert _tell_unfinished(runs) == 1
+    assert capsys.readouterr().err == f"run {steps - 1} made {steps - 1} of {steps} updates so far\n"
 
 
 def test_settings_that_cannot_be_swept_are_refused(folder, tmp_path, monkeypatch):

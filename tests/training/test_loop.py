@@ -107,6 +107,29 @@ def test_a_failing_evaluation_loses_no_update_and_a_resumed_run_begins_with_it(w
     assert "due" not in checkpoints.manifest(30).progress
 
 
+def test_an_evaluation_that_is_made_again_is_recorded_once(whole, tmp_path, monkeypatch):
+    """Regression: a run that was killed between record and checkpoint had the record twice."""
+
+    def failing(params):
+        raise MemoryError("the device is full")
+
+    def killed(self, state, manifest):
+        if manifest.metrics:
+            raise RuntimeError("killed")
+        return save(self, state, manifest)
+
+    with pytest.raises(MemoryError):
+        run(tmp_path / "run", evaluate=failing)
+    save = Checkpoints.save
+    monkeypatch.setattr(Checkpoints, "save", killed)
+    with pytest.raises(RuntimeError, match="killed"):
+        run(tmp_path / "run", start="resume")
+    monkeypatch.setattr(Checkpoints, "save", save)
+    run(tmp_path / "run", start="resume")
+    assert arrays(tmp_path / "run") == arrays(whole)
+    assert timeless(tmp_path / "run") == timeless(whole)
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_finishes_the_step_and_saves_it(whole, tmp_path, number):
     def evaluate_and_signal(params):

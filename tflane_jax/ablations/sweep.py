@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import sys
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +15,7 @@ from tflane_jax.config import RunConfig
 from tflane_jax.config_help import meaning
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import check_folder
-from tflane_jax.plots.tables import format_table, save_table
+from tflane_jax.plots.tables import counted, format_table, save_table
 from tflane_jax.progress import progress_bar
 from tflane_jax.runs import Run, load_test_data, open_run
 
@@ -52,6 +53,7 @@ def sweep(
         raise UserError(f"--setting {setting}: give a setting of the data (data...), the models are trained already")
     check_folder(out)
     runs = {name: runs_below(folder, which) for name, folder in models.items()}
+    unfinished = _tell_unfinished([run for each in runs.values() for run in each]) if which == "last" else 0
     tested = {
         value: {name: [_tested(run.config, f"--{setting}", value, *overrides) for run in runs[name]] for name in runs}
         for value in values
@@ -85,6 +87,8 @@ def sweep(
         found = compact({name: by_value[i] for name, by_value in scores.items()}, metrics)
         rows += [{setting: value} | row for row in found]
     title = f"{protocol}, test split, {which} checkpoint, percent (mean ± std over seeds)"
+    if unfinished:
+        title += f"; {counted(unfinished, 'run')} not finished"
     print("\n" + format_table(rows, title=title))
     meta = {"protocol": protocol, "checkpoint": which, "setting": setting, "values": list(values), "scores": scores}
     written = list(save_table(out / "sweep", rows, meta, title=title))
@@ -95,6 +99,14 @@ def sweep(
         written.append(save_sweep(out / "sweep.png", scores, setting, values, metrics, meaning=meaning(first, setting)))
     print("\nwritten:", *written, sep="\n  ")
     return written[0]
+
+
+def _tell_unfinished(runs: Sequence[Run]) -> int:
+    """Write a line for each run that stopped amid its updates, and return how many these are."""
+    found = [run for run in runs if 0 < run.step < run.config.training.steps]  # converted weights made none here
+    for run in found:
+        print(f"{run.name} made {run.step} of {run.config.training.steps} updates so far", file=sys.stderr)
+    return len(found)
 
 
 def _tested(config: RunConfig, *arguments: str) -> RunConfig:

@@ -259,7 +259,7 @@ def train(
         saved_step, stopped = first, stop_signal(stop.signal, 0)
         untold = dict(getattr(task, "notices", {}))
         with (
-            RecordWriter(folder, first) if is_first() else Unwritten() as writer,
+            RecordWriter(folder, first, due) if is_first() else Unwritten() as writer,
             progress_bar(total=config.steps, initial=first, desc=folder.name, unit="step", disable=not progress) as bar,
         ):
 

@@ -61,11 +61,13 @@ class RecordWriter:
     Args:
         folder: the run's folder.
         step: step from which the run starts or resumes; later records of an earlier process are dropped.
+        due: whether the run begins with the evaluation of this step, whose records are dropped, too.
     """
 
-    def __init__(self, folder: Path, step: int):
+    def __init__(self, folder: Path, step: int, due: bool = False):
         self._path = path = folder / "metrics.jsonl"
-        self.records = [record for record in read_records(path) if record["step"] <= step]
+        earlier = [record for record in read_records(path) if record["step"] <= step]
+        self.records = [r for r in earlier if not due or r["step"] < step or r["split"] == "train"]
         write_text(path, "".join(_line(record) for record in self.records))
         with self._write_errors():
             self._board = _Board(folder / "tensorboard", step + 1 if self.records else None)

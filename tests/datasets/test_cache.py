@@ -211,6 +211,25 @@ def test_a_file_system_without_locks_is_told_and_used(tmp_path, monkeypatch, cap
     delete_entry(entry)
 
 
+def test_without_locks_two_builders_of_an_entry_leave_each_other_alone(tmp_path, monkeypatch):
+    """Regression: the second deleted what the first had built so far."""
+
+    def no_locks(*_):
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    def during_which_another_builds(*arguments, **options):
+        monkeypatch.setattr(cache, "fill", fill)
+        others.append(build(tmp_path))
+        return fill(*arguments, **options)
+
+    others, fill = [], cache.fill
+    monkeypatch.setattr("fcntl.flock", no_locks)
+    monkeypatch.setattr(cache, "fill", during_which_another_builds)
+    own = build(tmp_path)
+    assert_same(own.example(1), others[0].example(1))
+    assert len(entries(tmp_path)) == 1
+
+
 def test_a_lock_that_was_deleted_with_its_entry_is_taken_anew(tmp_path, monkeypatch):
     import fcntl
 

@@ -34,7 +34,7 @@ from tflane_jax.datasets.leaves import example_from_leaves
 from tflane_jax.datasets.parallel import fill, frame_leaves, leaf_path
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import rename_flushed
-from tflane_jax.files.locks import take
+from tflane_jax.files.locks import is_at, take
 from tflane_jax.scene import Example
 
 # Errors of a folder that cannot be a cache.
@@ -104,10 +104,13 @@ def cached(
         return CachedDataset(folder)
     try:
         root.mkdir(parents=True, exist_ok=True)
-        with _only_builder(folder):
+        with _only_builder(folder) as alone:
             # Another process may have finished it while this one waited for the lock.
             with contextlib.suppress(DamagedEntry, FileNotFoundError):
                 return CachedDataset(folder)
+            if alone:  # any such folder was left behind by a killed build
+                for stale in folder.parent.glob(f"{folder.name}.building-*"):
+                    shutil.rmtree(stale, ignore_errors=True)
             _build(dataset, folder, mark, workers or working_cores(), progress)
     except OSError as error:
         raise _explain(error, root) from error
@@ -267,10 +270,7 @@ def _is_whole(index: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> boo
 
 
 def _build(dataset: Cacheable, folder: Path, mark: str, workers: int, progress: bool) -> None:
-    """Build the entry beside its final path and rename it."""
-    # The lock makes this the only builder, so any such folder was left behind by a killed build.
-    for stale in folder.parent.glob(f"{folder.name}.building-*"):
-        shutil.rmtree(stale, ignore_errors=True)
+    """Build the entry beside its final path and rename it, unless it is there by then: not all disks have locks."""
     template, _ = frame_leaves(dataset, 0)
     needed = len(dataset) * sum(leaf.nbytes for leaf in template.values())
     if needed > shutil.disk_usage(folder.parent).free:
@@ -288,6 +288,9 @@ def _build(dataset: Cacheable, folder: Path, mark: str, workers: int, progress: 
             "scenes": scenes,
         }
         (temporary / "index.json").write_text(json.dumps(index, indent=1), encoding="utf-8")
+        with contextlib.suppress(DamagedEntry, FileNotFoundError):
+            CachedDataset(folder)
+            return
         if folder.is_dir():  # damaged
             shutil.rmtree(folder)
         else:
@@ -304,10 +307,13 @@ def _summary(path: Path) -> dict[str, int]:
 
 
 @contextlib.contextmanager
-def _only_builder(folder: Path) -> Iterator[None]:
-    """Hold the entry's lock. Where there are none, nothing prevents two processes from building one entry at once."""
+def _only_builder(folder: Path) -> Iterator[bool]:
+    """Hold the entry's lock; give whether there are locks. Without, two processes may build one entry at once."""
+    alone = True
 
     def without_locks(reason: str) -> None:
+        nonlocal alone
+        alone = False
         print(
             f"{folder.parent}: this file system has no locks ({reason}): processes that need the same examples at once "
             "may each make them",
@@ -322,17 +328,9 @@ def _only_builder(folder: Path) -> Iterator[None]:
                 print(f"waiting for another process that builds {folder.name}", file=sys.stderr)
                 take(lock, wait=True)
             # Whoever deletes an entry deletes its lock too, perhaps while this process waited for it.
-            if _is_at(lock.fileno(), path):
+            if is_at(lock.fileno(), path):
                 break
-        yield
-
-
-def _is_at(handle: int, path: Path) -> bool:
-    """Return whether an open file is still the one that a path names."""
-    try:
-        return os.path.samestat(os.fstat(handle), os.stat(path))
-    except FileNotFoundError:
-        return False
+        yield alone
 
 
 def _explain(error: OSError, root: Path) -> Exception:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
+from pathlib import Path
 from typing import IO, Any
 
 try:
@@ -35,3 +37,11 @@ def take(
         if tell is not None:
             tell(error.strerror or str(error))
     return True
+
+
+def is_at(file: int, path: Path) -> bool:
+    """Return whether an open file, given by its number, is still the one that a path names."""
+    try:
+        return os.path.samestat(os.fstat(file), os.stat(path))
+    except FileNotFoundError:
+        return False

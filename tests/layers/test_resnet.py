@@ -65,6 +65,19 @@ def check(case):
         np.testing.assert_allclose(value, expected, rtol=2e-5, atol=2e-5, err_msg=str(place))
 
 
+def test_norms_of_frozen_parts_keep_their_statistics():
+    """Regression: a training moved them, and normalised by those of its batch, where `frozen_norms` was not set."""
+    model = ResNet(ResNetConfig((1, 1), (4, 4), (1, 2), 4), frozen_stages=2)
+    images = jnp.asarray(np.random.default_rng(0).normal(3.0, 2.0, (2, 16, 16, 3)), jnp.float32)
+    variables = model.init(jax.random.key(0), images, train=False)
+    outputs, changed = model.apply(variables, images, train=True, mutable=["batch_stats"])
+    before, after = variables["batch_stats"], changed["batch_stats"]
+    for frozen in ("bn1", "layer1_0"):
+        jax.tree.map(np.testing.assert_array_equal, after[frozen], before[frozen])
+    assert not np.array_equal(after["layer2_0"]["bn1"]["mean"], before["layer2_0"]["bn1"]["mean"])
+    np.testing.assert_array_equal(outputs[0], model.apply(variables, images, train=False)[0])
+
+
 @pytest.mark.parametrize("size", [(6, 8), (7, 9), (6, 9), (2, 2), (1, 1)])
 def test_stem_is_a_convolution_of_stride_two_at_any_size(size):
     stem = StemConvolution(4)

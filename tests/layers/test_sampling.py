@@ -153,3 +153,21 @@ def test_gradients_have_the_dtypes_of_what_they_belong_to():
         attend = lambda value, *places: deformable_attention(value, ((3, 4),), *places).sum()  # noqa: E731
         gradients = jax.grad(attend, (0, 1, 2))(*given)
     assert [g.dtype for g in gradients] == [x.dtype for x in given]
+
+
+def test_gradients_by_locations_are_those_of_float32_also_for_bfloat16():
+    """Regression: slopes were differences of products that had been rounded to bfloat16."""
+    rng, (height, width) = np.random.default_rng(0), (9, 12)
+    across, down = np.meshgrid(np.linspace(0, 1, width), np.linspace(0, 1, height))
+    smooth = 3.0 + np.sin(2 * across + 3 * down).reshape(-1, 1, 1) * rng.normal(size=(1, 2, 4))
+    value = jnp.asarray(smooth, jnp.bfloat16)
+    location = jnp.asarray(rng.uniform(0.1, 0.9, (5, 2, 1, 3, 2)), jnp.float32)
+    weight = jnp.asarray(rng.uniform(size=(5, 2, 1, 3)), jnp.float32)
+    pull = jnp.asarray(rng.normal(size=(5, 8)), jnp.bfloat16)
+
+    def gradient(value, pull):
+        total = lambda at: (deformable_attention(value, ((height, width),), at, weight) * pull).astype(jnp.float32)  # noqa: E731
+        return jax.grad(lambda at: total(at).sum())(location)
+
+    want = gradient(value.astype(jnp.float32), pull.astype(jnp.float32))
+    assert np.linalg.norm(gradient(value, pull) - want) < 1e-3 * np.linalg.norm(want)

@@ -55,6 +55,13 @@ def test_long_kernels_are_optaxs_also_with_tiny_singular_values(shape):
     assert np.linalg.norm(found + expected) < 2e-3 * np.linalg.norm(expected)
 
 
+@pytest.mark.parametrize("shape", [(6, 40), (6, 6)])
+def test_products_are_those_of_float32_on_every_device(shape):
+    """Regression: TF32, a GPU's default, made the updates of long kernels up to 20 times too long."""
+    program = str(jax.make_jaxpr(orthogonal)(as_vectors({"kernel": jnp.ones(shape)})))
+    assert program.count("dot_general[") == program.count("precision=(Precision.HIGHEST, Precision.HIGHEST)") > 0
+
+
 def test_one_iteration_for_all_kernels_of_a_shape():
     def products(shapes):
         return str(jax.make_jaxpr(orthogonal)(as_vectors(gradients(shapes, 0)))).count("dot_general")

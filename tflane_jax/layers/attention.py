@@ -137,16 +137,18 @@ def _attend_forward(query, key, value, mask):
     weights = jnp.exp(logits - _finite_max(logits))
     total = weights.sum(-1, keepdims=True)
     # Dividing the result, not the weights, saves a pass over them.
-    inverse = (1.0 / jnp.where(total > 0, total, 1.0)).astype(value.dtype)
+    inverse = 1.0 / jnp.where(total > 0, total, 1.0)
     weights = weights.astype(value.dtype)
-    out = jnp.einsum("hqk,hke->hqe", weights, value) * inverse
-    return out, (query, key, value, mask, weights, inverse, out)
+    # The gradient takes a difference with the result: that is kept as float32, also for bfloat16.
+    out = jnp.einsum("hqk,hke->hqe", weights, value, preferred_element_type=inverse.dtype) * inverse
+    return out.astype(value.dtype), (query, key, value, mask, weights, inverse, out)
 
 
 def _attend_backward(residuals, gradient):
     query, key, value, mask, weights, inverse, out = residuals
     query, key = _clear_queries(query, mask), _clear_keys(key, mask)
-    return *_gradients(query, key, value, weights, out, gradient * inverse), None
+    gradient = (gradient.astype(inverse.dtype) * inverse).astype(value.dtype)
+    return *_gradients(query, key, value, weights, out, gradient), None
 
 
 _attend.defvjp(_attend_forward, _attend_backward)
@@ -158,14 +160,14 @@ def _gradients(query, key, value, weights, out, gradient):
     Args:
         query, key, value: 0 for queries that see no key, and in slots that no query sees.
         weights: exp(logits) up to a factor per row.
-        out: the result of attention.
+        out: the result of attention, float32 or finer.
         gradient: of the result, divided by the sum of the row's weights.
     """
     to_value = jnp.einsum("hqk,hqe->hke", weights, gradient)
     dtype = _softmax_dtype(value)
     to_weight = jnp.einsum("hqe,hke->hqk", gradient, value, preferred_element_type=dtype)
     # Softmax: dz = p (dp - sum_k p dp), and sum_k p dp = out . d out.
-    along = (gradient.astype(dtype) * out.astype(dtype)).sum(-1, keepdims=True)
+    along = (gradient.astype(dtype) * out).sum(-1, keepdims=True)
     to_logit = weights.astype(dtype) * (lax.optimization_barrier(to_weight) - along) / math.sqrt(query.shape[-1])
     to_logit = lax.optimization_barrier(to_logit.astype(query.dtype))
     to_query = jnp.einsum("hqk,hkd->hqd", to_logit, key)
@@ -186,10 +188,11 @@ def _in_blocks_forward(rows, query, key, value, mask):
         query, mask = inputs
         logits = _logits(query, key, mask)
         log_total = _log_total(logits)
-        return jnp.einsum("hqk,hke->hqe", jnp.exp(logits - log_total).astype(value.dtype), value), log_total
+        weights = jnp.exp(logits - log_total).astype(value.dtype)
+        return jnp.einsum("hqk,hke->hqe", weights, value, preferred_element_type=log_total.dtype), log_total
 
     out, log_total = lax.map(block, (_split(query, rows), _split_mask(mask, query.shape[1], rows)))
-    return _join(out), (query, key, value, mask, out, log_total)
+    return _join(out).astype(value.dtype), (query, key, value, mask, out, log_total)
 
 
 def _in_blocks_backward(rows, residuals, gradient):

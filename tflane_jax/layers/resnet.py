@@ -81,13 +81,13 @@ class ResNet(nn.Module):
 
         Args:
             images: stack of views, finite.
-            train: norms use batch statistics, unless they are frozen.
+            train: norms use batch statistics, unless they or their stage are frozen.
             valid: which views count in these statistics; None for all.
         """
         config = self.config
         x = StemConvolution(config.stem_channels, self.dtype, name="conv1")(images)
-        x = nn.relu(BatchNorm(config.frozen_stem_norm or config.frozen_norms, name="bn1")(x, train=train, valid=valid))
-        x = max_pool(x)
+        norm = BatchNorm(config.frozen_stem_norm or config.frozen_norms, name="bn1")
+        x = max_pool(nn.relu(norm(x, train=train and self.frozen_stages == 0, valid=valid)))
         x = lax.stop_gradient(x) if self.frozen_stages > 0 else x
         block = BasicBlock if config.block == "basic" else Bottleneck
 
@@ -95,7 +95,7 @@ class ResNet(nn.Module):
             for i in range(config.blocks[stage]):
                 stride, name = config.strides[stage] if i == 0 else 1, f"layer{stage + 1}_{i}"
                 part = block(config.channels[stage], stride, config.frozen_norms, self.dtype, name=name)
-                x = part(x, train=train, valid=valid)
+                x = part(x, train=train and self.frozen_stages <= stage + 1, valid=valid)
             return x
 
         outputs = []

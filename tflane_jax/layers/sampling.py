@@ -216,7 +216,8 @@ def _step_backward(shapes, table, total, start, location, weight, cotangent):
     factors = jnp.stack([b * a * weight for b in down for a in across], 1).reshape(rows.shape)
     total = total.at[rows].add(cotangent[:, None] * factors[..., None], mode="promise_in_bounds")
     sampled = table.at[rows].get(mode="promise_in_bounds")
-    products = jnp.einsum("nkd,nd->nk", sampled, cotangent).reshape(len(row), 4, -1)
+    # Slopes are differences of these between neighbouring cells.
+    products = jnp.einsum("nkd,nd->nk", sampled, cotangent, preferred_element_type=total.dtype).reshape(len(row), 4, -1)
 
     def summed(across, down):
         # Over the four. Written out: as the reduction of an array it would take half of the time of a step.

@@ -17,7 +17,8 @@ class LaneWeights:
     Attributes:
         class_weight, points_weight: of both cost and loss; points in metres, summed over coordinates.
         successor_weight, element_lane_weight: of the topology of lanes, and of that with traffic elements.
-        alpha, gamma: parameters of every focal term.
+        alpha, gamma: parameters of the focal terms of lanes. Traffic elements have their own; those of areas (0.25, 2)
+            and of the heat map of proposals (2) are fixed.
         matcher: backend of `matching.match`.
         elements: weights of traffic elements, where the model predicts them.
         class_target: of a query matched with a lane: "one", or "quality", which falls with its distance from the lane

@@ -48,6 +48,17 @@ def test_a_full_output_is_one_line():
     ("arguments", "message"),
     [
         ("compare tf_lane/toponet gtn_lane/lstr --seeds 1 4294967296", "--seeds 4294967296: a seed is a whole number"),
+        (
+            "compare tf_lane/toponet --training.seeds 7 8",
+            "--training.seeds is of `tflane train`: give compare its seeds",
+        ),
+        ("export RUN --out model.json", "--out model.json: the table of latencies has this name"),
+        ("score tusimple pr\udce9d.json truth.json", "cannot read 'pr\\udce9d.json': the name is not UTF-8"),
+        (
+            "summary --no-compile --config tf_lane/toponet_tfm:street --data.example.history 10",
+            "the model reads 20 past frames (task.model.priors.traffic_flow.prior.frames), and examples hold 10",
+        ),
+        ("summary --no-compile --config tf_lane/toponet --data FrontViewData", "this configuration's data are"),
         ("cache list --import ends.py", "module ends.py (--import or TFLANE_IMPORT) cannot be imported: SystemExit: 3"),
     ],
 )

@@ -99,6 +99,16 @@ def test_no_photo_is_replaced_by_a_picture(predict, tmp_path):
     assert predict("out/road.png") == 0  # its earlier picture may be replaced
 
 
+def test_a_photo_whose_name_is_not_utf8_stops_no_other(predict, tmp_path, capsys):
+    photo(tmp_path / "a.png")
+    photo(tmp_path / "b.png")
+    (tmp_path / "b.png").rename(tmp_path / "lat\udce9.png")
+    assert predict(".") == 2
+    assert "lat\\udce9.png': the name is not UTF-8; rename the file" in capsys.readouterr().err
+    written = report(tmp_path)
+    assert (len(written["photos"]), len(written["faults"]), written["complete"]) == (1, 1, True)
+
+
 def test_a_missing_package_is_no_fault_of_the_photos(predict, tmp_path, monkeypatch):
     photo(tmp_path / "a.png")
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
@@ -113,6 +123,7 @@ def test_a_missing_package_is_no_fault_of_the_photos(predict, tmp_path, monkeypa
         (["a.png"], {"root": "TUSIMPLE"}, "--root selects labelled examples, and a.png is given too: leave one out"),
         (["a.png"], {"split": "test"}, "--split selects"),
         (["a.png"], {"count": 3}, "--count selects"),
+        (["a.png"], {"data_dict": "val"}, "--data-dict selects"),
         ([], {"horizon": 300.0}, "--horizon is of photos: name some, or leave it out"),
         ([], {"focal": 0.0}, "--focal is of photos"),
     ],
@@ -120,7 +131,9 @@ def test_a_missing_package_is_no_fault_of_the_photos(predict, tmp_path, monkeypa
 def test_options_without_effect_are_refused(tmp_path, monkeypatch, inputs, setting, said):
     trained = SimpleNamespace(config=SimpleNamespace(task=LaneShapeTask()), name="model")
     monkeypatch.setattr(predict_command, "opened", lambda options: (trained, [Path(name) for name in inputs]))
-    options = dict.fromkeys(("threshold", "split", "data", "root", "openlane", "count", "focal", "horizon"))
+    options = dict.fromkeys(
+        ("threshold", "split", "data", "root", "openlane", "data_dict", "count", "focal", "horizon")
+    )
     options |= {"out": tmp_path} | setting
     with pytest.raises(UserError, match=said):
         predict_command.run(Namespace(**options))

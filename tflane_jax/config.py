@@ -127,6 +127,8 @@ def _load_config(name: str, ablation: str) -> RunConfig:
         config = _run_function(find_config(name), "get_config", RunConfig)
         return _checked(find_config(name), with_reference_batch(config, config))
     ablations = load_ablations(name)
+    if odd := [key for key in ablations if not isinstance(key, str)]:
+        raise UserError(f"config file {name}: ablations() has the name {odd[0]!r}; names are text")
     if ablation not in ablations:
         close = difflib.get_close_matches(ablation, ablations, 3)
         raise UserError(
@@ -307,7 +309,7 @@ def _checked(path: Path, config: RunConfig) -> RunConfig:
 def _lines_of(path: Path, error: SettingError) -> str:
     """Return the lines of a file that set a setting, in words for an error; "" if none can be identified."""
     name = re.sub(r"\[\d+\]$", "", error.setting).rpartition(".")[2]
-    given = [k for k in ast.walk(ast.parse(path.read_text("utf-8"))) if isinstance(k, ast.keyword) and k.arg == name]
+    given = [k for k in ast.walk(ast.parse(path.read_bytes())) if isinstance(k, ast.keyword) and k.arg == name]
     written = [k for k in given if ast.unparse(k.value) == error.shown] or given
     return f", line {' or '.join(str(k.lineno) for k in written)}" if written else ""
 

@@ -7,7 +7,7 @@ import pytest
 
 from tflane_jax.plots import add_legend, new_figure, style
 from tflane_jax.plots.bev import draw_evidence, prepare
-from tflane_jax.plots.figure import columns_for
+from tflane_jax.plots.figure import columns_for, save_figure
 
 pytest.importorskip("matplotlib")
 from matplotlib.image import imread
@@ -36,6 +36,17 @@ def test_a_notebook_shows_lines_in_their_colours():
         rgb = [int(colour[i : i + 2], 16) for i in (1, 3, 5)]
         assert (shown == rgb).all(-1).sum() > 50, colour
     assert (shown[0, 0] == 255).all()
+
+
+def test_names_with_dollar_signs_and_rare_letters_are_no_formulas(tmp_path):
+    """Regression: a photo called a$1_$2.png ended `tflane predict`, a row of that name `tflane compare`."""
+    figure, axes = new_figure()
+    axes[0, 0].plot([1, 1e5], label=r"($\foo$) 车道")
+    axes[0, 0].set_yscale("log")
+    axes[0, 0].set_title("a$1_$2.png")
+    axes[0, 0].legend()
+    assert save_figure(figure, tmp_path / "names.png").stat().st_size > 1000
+    assert axes[0, 0].get_yticklabels()[1].get_parse_math()  # powers of ten
 
 
 def test_curves_of_a_notebook_have_the_colours_of_the_library():

@@ -39,7 +39,8 @@ OWN_TEST = ""
 def with_test_set(config: RunConfig, settings: Sequence[str]) -> RunConfig:
     """Return the configuration whose test split is a named test set; its own for no settings.
 
-    Raises UserError for settings that are not of the data: the others cannot change in a trained model.
+    Raises UserError for settings that are not of the data, for the others cannot change in a trained model, and for
+    data that do not fit the model.
     """
     for name in settings:
         if name.startswith("--") and not name.startswith("--data"):
@@ -47,7 +48,9 @@ def with_test_set(config: RunConfig, settings: Sequence[str]) -> RunConfig:
     if not settings:
         return config
     training = replace(config.training, seeds=(0,), init_from=None)  # what all seeds share, for the cache
-    return replace(config, data=with_settings(replace(config, training=training), tuple(settings)).data)
+    data = with_settings(replace(config, training=training), tuple(settings)).data
+    config.task.check_settings(data)
+    return replace(config, data=data)
 
 
 @functools.lru_cache(maxsize=256)

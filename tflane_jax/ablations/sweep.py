@@ -119,6 +119,7 @@ def _tested(config: RunConfig, *arguments: str) -> RunConfig:
             f"a sweep changes settings of the data and the evaluation (--data..., --evaluation...), the models are "
             f"trained already: got {given}"
         )
+    config.task.check_settings(changed.data)
     return replace(config, data=changed.data, evaluation=changed.evaluation)
 
 

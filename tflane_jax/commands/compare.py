@@ -31,6 +31,9 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> int:
         raise UserError(f"--seeds {wrong[0]}: a seed is a whole number from 0 to {LARGEST_SEED}")
     if options.jobs < 1:
         raise UserError(f"--jobs {options.jobs}: at least one training runs at a time")
+    given = [*overrides, *(setting for _, _, settings in rows for setting in settings)]
+    if any(setting.partition("=")[0] == "--training.seeds" for setting in given):
+        raise UserError("--training.seeds is of `tflane train`: give compare its seeds by --seeds, such as --seeds 7 8")
     check_folder(options.out)
     configure_jax()
     with loaded_once():

@@ -23,6 +23,7 @@ from tflane_jax.datasets.openlane_export import export_openlane_v2, time_offset
 from tflane_jax.datasets.openlane_frames import subset_of
 from tflane_jax.datasets.openlane_sd_map import sd_records
 from tflane_jax.errors import UserError
+from tflane_jax.files.atomic import check_folder
 from tflane_jax.plots.tables import format_table
 from tflane_jax.scene import RoadImage
 from tflane_jax.scene.logs import Log
@@ -56,6 +57,7 @@ def _check_folders(out: Path, tracks: Path | None) -> None:
     for folder in (out,) if tracks is None else (out, tracks):
         if folder.is_dir() and any(folder.iterdir()):
             raise UserError(f"{folder} is not empty: choose another folder")
+        check_folder(folder)
     if tracks is None:
         return
     if tracks.resolve() == out.resolve():

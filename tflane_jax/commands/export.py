@@ -22,6 +22,8 @@ _TOLERANCE = 1e-5  # rounding depends on the batch size
 def run(options: argparse.Namespace) -> int:
     """Write the program, and the table of latencies beside it."""
     check_writable(options.out)
+    if options.out.suffix in (".md", ".json"):
+        raise UserError(f"--out {options.out}: the table of latencies has this name; choose one such as .stablehlo")
     check_stem(options.out.with_suffix(""))
     configure_jax()
     run, rest = opened(options)

@@ -46,7 +46,7 @@ def run(options: argparse.Namespace) -> int:
 
 def _check_inputs(options: argparse.Namespace, photos: list[Path]) -> None:
     """Raise UserError for options that would have no effect on photos, or without them."""
-    for name in ("split", "data", "root", "openlane", "count") if photos else ("focal", "horizon"):
+    for name in ("split", "data", "root", "openlane", "data_dict", "count") if photos else ("focal", "horizon"):
         if getattr(options, name) is not None:
             reason = f"selects labelled examples, and {photos[0]} is given too: leave one out" if photos else _OF_PHOTOS
-            raise UserError(f"--{name} {reason}")
+            raise UserError(f"--{name.replace('_', '-')} {reason}")

@@ -30,6 +30,7 @@ from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import write_json
 from tflane_jax.files.images import PHOTO_SUFFIXES, list_photos, opencv, read_image
 from tflane_jax.files.videos import VIDEO_SUFFIXES, read_frames, sample_frames, video_info, writing_video
+from tflane_jax.files.wording import check_name
 from tflane_jax.plots.figure import new_figure
 from tflane_jax.plots.images import lanes_drawn, save_photo
 from tflane_jax.plots.tables import counted
@@ -99,9 +100,11 @@ class _Report:
     def add(self, kind: str, path: Path, read: Callable[[], dict[str, Any]]) -> None:
         """Append what `read` returns, or the fault of its UserError."""
         try:
+            check_name(path)
             self.content[kind].append(read())
         except UserError as error:
-            self.content["faults"].append({"file": str(path), "error": str(error)})
+            name = str(path).encode(errors="backslashreplace").decode()
+            self.content["faults"].append({"file": name, "error": str(error)})
         if time.monotonic() - self._saved > _SAVED_EVERY:
             self.save()
 

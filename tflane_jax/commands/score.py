@@ -10,7 +10,7 @@ from typing import Any
 
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import check_stem
-from tflane_jax.files.wording import named
+from tflane_jax.files.wording import check_name, named
 from tflane_jax.metrics.groups import shown_of_part
 from tflane_jax.plots.tables import format_table, save_table, written_to
 from tflane_jax.scoring import remarks as about
@@ -74,6 +74,8 @@ def _check(options: argparse.Namespace, protocol: ScoringProtocol) -> None:
     if options.by not in (None, "scene", *protocol.groups):
         raise UserError(f"{options.protocol} cannot be reported by {options.by}")
     inputs = [path for path in (options.predictions, options.truth, options.scenes) if path is not None]
+    for path in inputs:
+        check_name(path)
     if _same(options.predictions, options.truth):
         raise UserError(f"{options.predictions} is given as PREDICTIONS and as GROUND_TRUTH: name the other file too")
     check_stem(options.out)

@@ -96,7 +96,8 @@ def with_chosen_topology(run: Run, options: argparse.Namespace) -> Run:
     """Return the run evaluated with the edges of --topology; raise UserError for a model that predicts none."""
     if options.topology is None:
         return run
-    if not isinstance(run.config.task, LaneGraphTask):
+    task = run.config.task
+    if not isinstance(task, LaneGraphTask) or not {"centerlines", "segments"} & {*task.model.predicts}:
         raise UserError("--topology is about which lane follows which, and this model does not predict it")
     evaluation = replace(run.config.evaluation, topology=options.topology)
     return replace(run, config=replace(run.config, evaluation=evaluation))

@@ -14,6 +14,7 @@ from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import check_stem
 from tflane_jax.plan import UTILISATION, make_plan
 from tflane_jax.plots.tables import format_table, save_table, written_to
+from tflane_jax.run_checks import check_kind
 from tflane_jax.summary import parameter_counts, prediction_program, shapes_of_params, training_program
 from tflane_jax.training.runtime import configure_jax
 
@@ -28,6 +29,8 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> int:
     configure_jax(keep_programs=False)  # compiling is timed
     config = load_config(options.config) if options.config else RunConfig()
     config = apply_overrides(config, overrides)
+    check_kind(config)
+    config.task.check_settings(config.data)
     example = config.task.shapes(config.data)
     if options.plan is not None:
         return _plan(options, config, example)

@@ -54,6 +54,8 @@ def run(options: argparse.Namespace) -> int:
         print(f"\n{_totals()}")
         return 0
     check_folder(options.out)
+    if options.record is not None:
+        check_folder(options.record)
     configure_jax()
     if jobs > 1 or options.cores is not None:
         accelerators.leave_to_workers()  # before converting uses a device

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import reprlib
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from tflane_jax.errors import UserError
 
 _LONGEST_NAME = 200
 _NAMED = 3
@@ -24,6 +27,14 @@ def shown(value: Any) -> str:
         return f"{reprlib.repr(value):.40}"
     except (RecursionError, ValueError):
         return f"a value {kind(value)}"
+
+
+def check_name(path: Path) -> None:
+    """Raise UserError for the name of an input that is not UTF-8, as in old archives: reports could not name it."""
+    try:
+        str(path).encode()
+    except UnicodeEncodeError:
+        raise UserError(f"cannot read {str(path)!a}: the name is not UTF-8; rename the file") from None
 
 
 def kind(value: Any) -> str:

@@ -20,7 +20,7 @@ def draw_temporal_mask(ax: Axes, frame_valid: Bool[Array, "t n"]) -> None:
     ax.set_ylabel("road user", fontsize=8)
 
 
-def draw_spatial_mask(ax: Axes, mask: Bool[Array, "s s"], lanes: int, *, title: str = "spatial mask $M_s$") -> None:
+def draw_spatial_mask(ax: Axes, mask: Bool[Array, "s s"], lanes: int, *, title: str = "spatial mask M_s") -> None:
     """Draw M_s, (L+T, L+T), as the four quadrants L->L, L->T, T->L, T->T. Light: row attends to column.
 
     To leave padding out, give rows and columns of valid tokens alone.

@@ -6,6 +6,7 @@ matplotlib is imported with the first figure, because the import takes a second 
 from __future__ import annotations
 
 import io
+import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -34,11 +35,23 @@ def new_figure(
     """
     try:
         from matplotlib.figure import Figure
+        from matplotlib.text import Text
     except ImportError as error:
         raise missing_extra("pictures need matplotlib", "plot") from error
 
     class NotebookFigure(Figure):
-        """A figure that a notebook shows when it is the last value of a cell, in 256 colours: half the bytes."""
+        """A figure that a notebook shows when it is the last value of a cell, in 256 colours: half the bytes.
+
+        Texts are drawn as they are, also those with dollar signs: names of files, rows and logs are no formulas.
+        """
+
+        def draw(self, renderer: Any) -> None:
+            for text in self.findobj(Text):
+                if "$" in text.get_text() and r"\mathdefault" not in text.get_text():  # which labels of axes have
+                    text.set_parse_math(False)
+            with warnings.catch_warnings():
+                warnings.filterwarnings("ignore", "Glyph .* missing from font", UserWarning)
+                super().draw(renderer)
 
         def _repr_png_(self) -> bytes:
             from PIL import Image  # matplotlib needs it too

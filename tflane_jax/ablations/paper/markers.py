@@ -178,6 +178,7 @@ _ON_EVIDENCE = (
         {"TopoNet": (28.5, 4.1, 20.6, 34.7), _OURS.name: (36.2, 8.8, 22.6, 40.5)},
         # What connectivity is for; DET_l is a column.
         primary="all/TOP_ll",
+        minutes=20.1,
     ),
     _table(
         "6",

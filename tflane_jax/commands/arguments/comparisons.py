@@ -37,7 +37,7 @@ def _seeds(text: str) -> Sequence[int]:
         raise argparse.ArgumentTypeError(f"{text!r} is neither a number of seeds nor a list of seeds such as 0,4-7")
     listed = [range(int(ends[0]), int(ends[-1]) + 1) for ends in bounds]
     ranges = [range(int(text))] if bounds == [[text]] else listed
-    if not 1 <= sum(map(len, ranges)) <= _MOST_SEEDS:
+    if not all(map(len, ranges)) or sum(map(len, ranges)) > _MOST_SEEDS:
         raise argparse.ArgumentTypeError(f"{text}: at least one, at most {_MOST_SEEDS}")
     return sorted({seed for each in ranges for seed in each})
 

@@ -160,7 +160,7 @@ def test_distributions_of_several_data_are_laid_side_by_side(tmp_path, capsys):
     [
         (["--beside", "front-views"], "are no lane graphs"),
         (["--beside", "nothing"], "there is no data source nothing"),
-        (["--beside", "recorded"], "--data recorded needs --root"),
+        (["--beside", "recorded"], "--beside recorded needs its folder: --beside recorded=PATH"),
         (["--out", "x"], "--out is the file of --beside"),
     ],
 )

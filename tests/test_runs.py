@@ -37,6 +37,16 @@ def config(tmp_path_factory):
     return replace(config, evaluation=replace(config.evaluation, pictures=0))
 
 
+def test_a_start_from_another_model_is_told_before_data_are_read(config, tmp_path, monkeypatch):
+    """Regression: it was told once the data were built, which may take an hour."""
+    save_weights(config, {"shift": {"kernel": jnp.zeros((1, 4))}}, tmp_path / "origin")
+    monkeypatch.setattr(LaneGraphTask, "load", None)
+    tuned = replace(config, training=replace(config.training, init_from=str(tmp_path / "origin")))
+    with pytest.raises(UserError, match=r"origin holds another model \(.* there, .* here\)"):
+        train_run(tuned, tmp_path / "run", progress=False)
+    assert not (tmp_path / "run").exists()
+
+
 def aged(content):
     """Return a configuration (JSON) as an older version wrote it: another name, and without a newer setting."""
     old = renamed_back(content, {"OptimConfig": {"optimizer": "matrices"}})

@@ -17,6 +17,7 @@ from tflane_jax.models.parameters import Params, first_misfit, split_statistics
 from tflane_jax.scene import Example, RoadImage, shapes_of
 from tflane_jax.tasks.base import AnyTask
 from tflane_jax.tasks.lane_shape import LaneShapeTask
+from tflane_jax.training.fine_tuning import check_fit
 from tflane_jax.training.rate_factors import factor_of_leaves
 from tflane_jax.training.vectors import layout_of
 
@@ -87,6 +88,22 @@ def check_model(config: RunConfig, params: Params, place: str) -> None:
             f"{place}: {difference}. Its configuration was changed after the training: undo that (config.txt in the "
             "run folder has the settings that the run was started with), or train the other model"
         )
+
+
+def check_origin_model(config: RunConfig) -> None:
+    """Raise UserError if the run to start from, which is there, holds another model.
+
+    It traces the model. No-op without such a run, and without the data that shapes of parameters depend on.
+    """
+    task, training = config.task, config.training
+    if training.init_from is None:
+        return
+    try:
+        example = task.shapes(config.data)
+    except UserError:
+        return
+    shapes = shapes_of_params(task, example)
+    check_fit(training.init_from, shapes, training.seeds, partly=training.init_partly, frozen=task.frozen)
 
 
 def _check_scores(config: RunConfig) -> None:

@@ -30,7 +30,7 @@ from tflane_jax.limits import check_settings
 from tflane_jax.migrations import migrate
 from tflane_jax.models.parameters import Params
 from tflane_jax.processes import agreed, from_first, is_first
-from tflane_jax.run_checks import check_model, check_rate_factors, check_run
+from tflane_jax.run_checks import check_model, check_origin_model, check_rate_factors, check_run
 from tflane_jax.startup import showing, stage
 from tflane_jax.training.checkpoint import Checkpoints, Manifest, Which
 from tflane_jax.training.fine_tuning import check_origins
@@ -96,6 +96,7 @@ def train_run(
         from_first(lambda: check_unchanged(folder, to_json(config), current_form))
     else:
         from_first(lambda: check_origin(config))
+        from_first(lambda: check_origin_model(config))
     with showing(progress and is_first()):
         return _train(config, folder, start=start, progress=progress, drawn=drawn)
 

@@ -46,6 +46,8 @@ def beside(config: RunConfig, options: argparse.Namespace) -> int:
     chosen = {options.data or sources.source_name(first): first}
     for text in options.beside:
         name, _, root = text.partition("=")
+        if not root and sources.named_source(name).root is not None:
+            raise UserError(f"--beside {name} needs its folder: --beside {name}=PATH")
         openlane = options.openlane if name == _READS_OPENLANE else None
         split = None if name == recorded_logs.SOURCE.name else options.split  # a folder of recordings has no splits
         source = chosen_source(

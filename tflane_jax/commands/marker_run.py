@@ -38,6 +38,7 @@ from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import check_folder, write_bytes, write_json
 from tflane_jax.files.images import opencv
 from tflane_jax.geometry import PerceptionRange, invert_pose
+from tflane_jax.limits import check_settings
 from tflane_jax.markers.image_search import DetectorConfig
 from tflane_jax.markers.observe import Outcome
 from tflane_jax.markers.reader import MarkerReader, ReaderConfig
@@ -271,6 +272,7 @@ def render(options: argparse.Namespace) -> int:
         raise UserError(f"{log.name} has no junction, split or merge, and so no marker: take another --log")
     mounts = ring[: options.cameras]
     rig = CameraRigConfig(cameras=mounts, scale=options.scale, markers=True)
+    check_settings(rig, "--")
     cv2, images = opencv(), options.out / "images"
     make_folder(images)
     frames = []

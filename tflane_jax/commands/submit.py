@@ -40,7 +40,9 @@ def run(options: argparse.Namespace) -> int:
     if rest:
         raise UserError(f"tflane submit takes one run: leave {rest[0]} out")
     task = trained.config.task
-    predicts = set(task.model.predicts) if isinstance(task, LaneGraphTask) else set()
+    if not isinstance(task, LaneGraphTask):
+        raise UserError("this model finds lanes in one image: OpenLane-V2 and nuScenes have no such task")
+    predicts = set(task.model.predicts)
     if options.data is None and options.root is not None:
         options.data = "nuscenes" if "lines" in predicts else "openlane-v2"
     source = source_for(trained, options)

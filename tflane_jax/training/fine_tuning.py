@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +42,14 @@ def starting_params(
         _params_of_run(folder, fresh.params, seed, partly=partly, frozen=frozen)
         for folder, fresh, seed in zip(origin_folders(reference, seeds), states, seeds, strict=True)
     ]
+
+
+def check_fit(
+    reference: str, shapes: Params, seeds: Sequence[int], *, partly: bool, frozen: Sequence[str] = ()
+) -> None:
+    """Raise UserError as `starting_params` does, given the shapes of the fresh parameters."""
+    for folder, seed in zip(origin_folders(reference, seeds), seeds, strict=True):
+        _differences(folder, _saved(folder, seed), flat(shapes), partly=partly, frozen=frozen)
 
 
 def check_origins(reference: str, seeds: Sequence[int]) -> None:
@@ -88,9 +96,24 @@ def _place(seed: int, of_run: Sequence[int]) -> int:
 
 
 def _params_of_run(folder: Path, fresh: Params, seed: int, *, partly: bool, frozen: Sequence[str]) -> Params:
+    saved, wanted = _saved(folder, seed), flat(fresh)
+    added, dropped = _differences(folder, saved, wanted, partly=partly, frozen=frozen)
+    for names, what in ((added, "start afresh"), (dropped, "are left out")):
+        if names:
+            write(f"from {folder}: {_modules(names)} {what}")
+    return unflatten_dict({name: saved.get(name, value) for name, value in wanted.items()}, sep="/")
+
+
+def _saved(folder: Path, seed: int) -> dict[str, Any]:
+    """Return the parameters of a run that a seed starts from, by name."""
     checkpoints, step, seeds = _starting_checkpoint(folder)
-    params = per_seed(checkpoints.params(step), seeds)[_place(seed, seeds)]
-    saved, wanted = (flat(tree) for tree in (params, fresh))
+    return flat(per_seed(checkpoints.params(step), seeds)[_place(seed, seeds)])
+
+
+def _differences(
+    folder: Path, saved: Mapping[str, Any], wanted: Mapping[str, Any], *, partly: bool, frozen: Sequence[str]
+) -> tuple[list[str], list[str]]:
+    """Return the names of parameters that only the new model has, and only the run's; raise UserError for a misfit."""
     for name in sorted(saved.keys() & wanted.keys()):
         if _shape(saved[name]) != _shape(wanted[name]):
             raise UserError(
@@ -111,10 +134,7 @@ def _params_of_run(folder: Path, fresh: Params, seed: int, *, partly: bool, froz
             raise UserError(
                 f"training.init_from: {folder} has no {module}, which this configuration freezes: it would stay random"
             )
-    for names, what in ((added, "start afresh"), (dropped, "are left out")):
-        if names:
-            write(f"from {folder}: {_modules(names)} {what}")
-    return unflatten_dict({name: saved.get(name, value) for name, value in wanted.items()}, sep="/")
+    return added, dropped
 
 
 def _shape(leaf: jax.Array) -> tuple[tuple[int, ...], str]:

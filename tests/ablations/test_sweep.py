@@ -9,7 +9,7 @@ import pytest
 from tests.ablations.test_compare import CONFIG
 from tests.models.cases import BASELINE
 from tests.parameters import random_params
-from tflane_jax.ablations.sweep import _tell_unfinished, runs_below, sweep
+from tflane_jax.ablations.sweep import _tell_unfinished, sweep
 from tflane_jax.cli import main
 from tflane_jax.errors import UserError
 from tflane_jax.runs import Run, save_weights
@@ -58,35 +58,3 @@ def test_runs_that_are_not_finished_are_named(capsys):
     runs = [Run(f"run {step}", CONFIG, step, ()) for step in (0, steps - 1, steps)]
     assert _tell_unfinished(runs) == 1
     assert capsys.readouterr().err == f"run {steps - 1} made {steps - 1} of {steps} updates so far\n"
-
-
-def test_settings_that_cannot_be_swept_are_refused(folder, tmp_path, monkeypatch):
-    monkeypatch.setattr(LaneGraphTask, "evaluate", None)  # each mistake is told before the first evaluation
-    other = {"other": folder / "other"}
-    with pytest.raises(UserError, match="no metric all/wit, only all/"):
-        sweep(other, "data.world.severity", ["0", "1"], tmp_path, metrics=["all/recall", "all/wit"])
-    with pytest.raises(UserError, match="severity"):
-        sweep(other, "data.world.severity", ["0", "heavy"], tmp_path)
-    with pytest.raises(UserError, match=r"changes settings of the data and the evaluation .* --training\.batch_size"):
-        sweep(other, "data.world.severity", ["0"], tmp_path, ["--training.batch_size", "3"])
-    with pytest.raises(UserError, match="give a setting of the data"):
-        sweep({"other": folder / "other"}, "optim.lr", ["1"], tmp_path)
-    with pytest.raises(UserError, match="is no run folder, and holds none"):
-        runs_below(tmp_path)
-    with pytest.raises(UserError, match=r"unknown setting --data\.world\.severty"):
-        sweep({"other": folder / "other"}, "data.world.severty", ["1"], tmp_path)
-
-
-def test_models_with_different_test_data_are_refused(folder, tmp_path, monkeypatch):
-    monkeypatch.setenv("TFLANE_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr(LaneGraphTask, "evaluate", None)
-    config = dataclasses.replace(CONFIG, data=dataclasses.replace(CONFIG.data, test=CONFIG.data.test + 1))
-    example = jax.tree.map(jax.numpy.zeros_like, config.task.shapes(config.data))
-    save_weights(config, random_params(config.task.init, example, spread=0.2), tmp_path / "more")
-    models = {"other": folder / "other", "more": tmp_path / "more"}
-    with pytest.raises(
-        UserError, match=r"runs of other and more have different test data \(data\.world\.severity = 0\)"
-    ):
-        sweep(models, "data.world.severity", ["0"], tmp_path / "out")
-    with pytest.raises(TypeError, match="not callable"):  # the same test data: it goes on to evaluate
-        sweep(models, "data.world.severity", ["0"], tmp_path / "out", ["--data.test", "2"])

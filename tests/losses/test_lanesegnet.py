@@ -177,7 +177,7 @@ def test_a_mirrored_or_moved_scene_has_the_same_loss(motion, class_target):
 
 
 @pytest.mark.parametrize("class_target", with_slow(["one", "quality"], quick=["quality"]))
-@pytest.mark.parametrize("counts", [(0, 0), (1, 0), (4, 1)])
+@pytest.mark.parametrize("counts", [(0, 0), pytest.param((1, 0), marks=pytest.mark.slow), (4, 1)])
 def test_any_number_of_targets_has_a_finite_gradient(counts, class_target):
     prediction, targets, masks = make_case(1, counts)
     config = LaneSegNetLossConfig(class_target=class_target)

@@ -128,7 +128,7 @@ def same_loss(prediction, lines, other, config):
 
 
 @pytest.mark.parametrize("rings", ["one", "both"])
-@pytest.mark.parametrize("coordinates", [2, 3])
+@pytest.mark.parametrize("coordinates", with_slow([2, 3], quick=[3]))
 @pytest.mark.parametrize("steps", with_slow([1, 3], quick=[3]))
 def test_a_ring_may_start_anywhere_and_a_line_at_either_end(rings, coordinates, steps):
     prediction, lines = make_prediction(coordinates=coordinates), make_lines()

@@ -15,7 +15,7 @@ def features(config, bev, fuse=None):
     return jax.jit(lambda p, x: encoder.apply(p, x, fuse))(params, bev), params, encoder
 
 
-@pytest.mark.parametrize("shape", [(4, 4), (20, 28), (24, 40)])
+@pytest.mark.parametrize("shape", [(4, 4), pytest.param((20, 28), marks=pytest.mark.slow), (24, 40)])
 def test_levels_keep_the_shape_of_the_features(shape):
     config = EvidenceEncoderConfig(dim=8, levels=(16, 24), dilations=(), coordinates=True)
     x, params, _ = features(config, jnp.zeros((*shape, 4), jnp.uint8))

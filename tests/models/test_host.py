@@ -80,7 +80,7 @@ def fit(name):
     return task, params, jax.jit(partial(predicted, task))
 
 
-@pytest.mark.parametrize("name", with_slow(MODELS, QUICK))
+@pytest.mark.parametrize("name", with_slow(MODELS, ["traffic"]))
 def test_shapes_and_range(name):
     _, params, predict = fit(name)
     lanes = predict(params, make_line_example())

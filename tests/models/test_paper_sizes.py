@@ -70,7 +70,9 @@ def test_lanesegnet_is_as_large_as_the_reference():
     assert segments.successor_logits.shape == (1, 200, 200)
 
 
-@pytest.mark.parametrize(("attention", "expected"), [("kernel", MAPTR_HEAD), ("deformable", 11_604_836)])
+@pytest.mark.parametrize(
+    ("attention", "expected"), [("kernel", MAPTR_HEAD), pytest.param("deformable", 11_604_836, marks=pytest.mark.slow)]
+)
 def test_maptr_is_as_large_as_the_reference(attention, expected):
     config = maptr.paper_config()
     bev = dataclasses.replace(config.encoder.bev, attention=attention)

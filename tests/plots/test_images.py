@@ -69,7 +69,9 @@ def test_the_picture_of_a_narrow_photo_is_of_bounded_height(tmp_path, size, draw
         assert picture.size == (1056, pytest.approx(drawn, abs=5))
 
 
-@pytest.mark.parametrize(("count", "across", "down"), [(1, 1, 1), (3, 3, 1), (8, 4, 2), (9, 4, 3)])
+@pytest.mark.parametrize(
+    ("count", "across", "down"), [(1, 1, 1), (3, 3, 1), (8, 4, 2), pytest.param(9, 4, 3, marks=pytest.mark.slow)]
+)
 def test_images_without_predictions_share_rows(tmp_path, count, across, down):
     """Eight of them below each other made a picture five times as high as wide."""
     pytest.importorskip("matplotlib")

@@ -1,0 +1,58 @@
+"""What a sweep refuses before it evaluates anything, with a model that compiles in no time."""
+
+import dataclasses
+
+import jax
+import pytest
+
+from tests.ablations.test_compare import CONFIG
+from tests.tiny_run import fakes  # noqa: F401 (a fixture that is used by itself)
+from tflane_jax.ablations.sweep import runs_below, sweep
+from tflane_jax.errors import UserError
+from tflane_jax.runs import save_weights
+from tflane_jax.tasks.lane_graph import LaneGraphTask
+
+
+def saved(config, folder):
+    """Save an untrained model, and return its folder."""
+    example = config.task.shapes(config.data)
+    save_weights(config, config.task.init(jax.random.key(0), example), folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return saved(CONFIG, tmp_path_factory.mktemp("runs") / "other")
+
+
+def test_settings_that_cannot_be_swept_are_refused(folder, tmp_path, monkeypatch):
+    monkeypatch.setattr(LaneGraphTask, "evaluate", None)  # each mistake is told before the first evaluation
+    other = {"other": folder}
+    with pytest.raises(UserError, match="no metric all/wit, only all/"):
+        sweep(other, "data.world.severity", ["0", "1"], tmp_path, metrics=["all/recall", "all/wit"])
+    with pytest.raises(UserError, match="severity"):
+        sweep(other, "data.world.severity", ["0", "heavy"], tmp_path)
+    with pytest.raises(UserError, match=r"changes settings of the data and the evaluation .* --training\.batch_size"):
+        sweep(other, "data.world.severity", ["0"], tmp_path, ["--training.batch_size", "3"])
+    with pytest.raises(UserError, match=r"data\.example\.range"):  # numbers would come out all the same
+        sweep(other, "data.world.severity", ["0"], tmp_path, ["--data.example.range.x", "-60", "60"])
+    with pytest.raises(UserError, match="give a setting of the data"):
+        sweep({"other": folder}, "optim.lr", ["1"], tmp_path)
+    with pytest.raises(UserError, match="is no run folder, and holds none"):
+        runs_below(tmp_path)
+    with pytest.raises(UserError, match=r"unknown setting --data\.world\.severty"):
+        sweep({"other": folder}, "data.world.severty", ["1"], tmp_path)
+
+
+def test_models_with_different_test_data_are_refused(folder, tmp_path, monkeypatch):
+    monkeypatch.setenv("TFLANE_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(LaneGraphTask, "evaluate", None)
+    config = dataclasses.replace(CONFIG, data=dataclasses.replace(CONFIG.data, test=CONFIG.data.test + 1))
+    saved(config, tmp_path / "more")
+    models = {"other": folder, "more": tmp_path / "more"}
+    with pytest.raises(
+        UserError, match=r"runs of other and more have different test data \(data\.world\.severity = 0\)"
+    ):
+        sweep(models, "data.world.severity", ["0"], tmp_path / "out")
+    with pytest.raises(TypeError, match="not callable"):  # the same test data: it goes on to evaluate
+        sweep(models, "data.world.severity", ["0"], tmp_path / "out", ["--data.test", "2"])

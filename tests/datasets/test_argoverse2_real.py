@@ -79,10 +79,11 @@ def test_real_histories(name, means, largest, crowded):
 @pytest.mark.parametrize(
     ("name", "counts", "means"),
     [
-        (
+        pytest.param(
             FLAT,
             [[38, 21, 27], [40, 21, 27], [19, 12, 20], [21, 12, 20], [4, 4, 4], [4, 4, 7]],
             (25.2, 25.2, 14.4, 14.4),
+            marks=pytest.mark.slow,
         ),
         (
             FORKED,

@@ -126,7 +126,7 @@ def test_baseline_does_not_depend_on_traffic(name):
     assert_same(predict(params, make_line_example(5)), predict(params, make_line_example(5).replace(traffic_flow=None)))
 
 
-@pytest.mark.parametrize("name", with_slow(WITH_PRIOR, QUICK))
+@pytest.mark.parametrize("name", with_slow(WITH_PRIOR, ["traffic"]))
 def test_lanes_do_not_depend_on_the_order_of_instances(name):
     _, params, predict = fit(name)
     example = make_line_example(6)

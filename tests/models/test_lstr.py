@@ -109,7 +109,10 @@ def predict(config, variables, images, valid):
     return jax.vmap(lambda image, v: config.build().apply(variables, image, v))(images, valid)
 
 
-@pytest.mark.parametrize("path", [p for p in of_kind("pretrained") if "weights" not in p.stem], ids=case_id)
+OF_PUBLISHED = [path for path in of_kind("pretrained") if "weights" not in path.stem]
+
+
+@pytest.mark.parametrize("path", with_slow(OF_PUBLISHED, quick=["lstr_pretrained_road"]), ids=case_id)
 def test_published_weights_match_the_reference(path):
     case = load_module_case(path)
     if "images_x4_i8" in case.inputs:
@@ -190,8 +193,7 @@ def stacked_targets(images):
 
 
 def test_every_published_tensor_is_accounted_for():
-    path = shared_root() / "data" / "lstr" / "LSTR_500000.npz"
-    with np.load(path) as file:
+    with np.load(shared_path("data/lstr/LSTR_500000.npz")) as file:
         state = {name: file[name] for name in file.files}
     converted = convert_lstr(state)
     assert [row["tensor"] for row in converted.table] == list(state)

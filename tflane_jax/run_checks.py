@@ -17,7 +17,7 @@ from tflane_jax.models.parameters import Params, first_misfit, split_statistics
 from tflane_jax.scene import Example, RoadImage, shapes_of
 from tflane_jax.tasks.base import AnyTask
 from tflane_jax.tasks.lane_shape import LaneShapeTask
-from tflane_jax.training.fine_tuning import check_fit
+from tflane_jax.training.fine_tuning import check_origin_params
 from tflane_jax.training.rate_factors import factor_of_leaves
 from tflane_jax.training.vectors import layout_of
 
@@ -43,14 +43,8 @@ def check_rate_factors(config: RunConfig) -> None:
 
     It traces the model. No-op without patterns, and without the data that shapes of parameters depend on.
     """
-    if not config.optim.lr_factors:
-        return
-    try:
-        example = config.task.shapes(config.data)
-    except UserError:
-        return
-    learned, _ = split_statistics(shapes_of_params(config.task, example))
-    factor_of_leaves(layout_of(learned), config.optim.lr_factors)
+    if config.optim.lr_factors and (shapes := _known_shapes(config)) is not None:
+        factor_of_leaves(layout_of(split_statistics(shapes)[0]), config.optim.lr_factors)
 
 
 def check_kind(config: RunConfig) -> None:
@@ -79,11 +73,8 @@ def check_model(config: RunConfig, params: Params, place: str) -> None:
 
     No-op without the data of the configuration, which the shapes of some parameters depend on.
     """
-    try:
-        example = config.task.shapes(config.data)
-    except UserError:
-        return
-    if difference := first_misfit(params, shapes_of_params(config.task, example)):
+    shapes = _known_shapes(config)
+    if shapes is not None and (difference := first_misfit(params, shapes)):
         raise UserError(
             f"{place}: {difference}. Its configuration was changed after the training: undo that (config.txt in the "
             "run folder has the settings that the run was started with), or train the other model"
@@ -95,15 +86,19 @@ def check_origin_model(config: RunConfig) -> None:
 
     It traces the model. No-op without such a run, and without the data that shapes of parameters depend on.
     """
-    task, training = config.task, config.training
-    if training.init_from is None:
-        return
+    training = config.training
+    if training.init_from is not None and (shapes := _known_shapes(config)) is not None:
+        partly, frozen = training.init_partly, config.task.frozen
+        check_origin_params(training.init_from, shapes, training.seeds, partly=partly, frozen=frozen)
+
+
+def _known_shapes(config: RunConfig) -> Any:
+    """Return the shapes of the parameters; None without the data, which the shapes of some depend on."""
     try:
-        example = task.shapes(config.data)
+        example = config.task.shapes(config.data)
     except UserError:
-        return
-    shapes = shapes_of_params(task, example)
-    check_fit(training.init_from, shapes, training.seeds, partly=training.init_partly, frozen=task.frozen)
+        return None
+    return shapes_of_params(config.task, example)
 
 
 def _check_scores(config: RunConfig) -> None:

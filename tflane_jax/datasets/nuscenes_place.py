@@ -10,7 +10,7 @@ from typing import Any
 from tflane_jax.datasets.log_frames import LogOutline
 from tflane_jax.datasets.nuscenes_log import key_frames, scene_frames, scene_log
 from tflane_jax.datasets.nuscenes_map import MapExpansion, read_expansion
-from tflane_jax.datasets.nuscenes_tables import TABLES, shared_tables
+from tflane_jax.datasets.nuscenes_tables import TABLES, file_state, shared_tables
 from tflane_jax.errors import UserError
 from tflane_jax.files.fields import member
 from tflane_jax.files.json_rows import json_rows
@@ -72,8 +72,7 @@ def scene_outline(folder: Path, name: str) -> LogOutline:
 
 
 def _expansion(path: Path) -> MapExpansion:
-    state = path.stat() if path.is_file() else None
-    return _kept_expansion(path, state and (state.st_mtime_ns, state.st_size))
+    return _kept_expansion(path, file_state(path))
 
 
 @functools.lru_cache(maxsize=4)

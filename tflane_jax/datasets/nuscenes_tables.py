@@ -211,8 +211,15 @@ def shared_tables(folder: Path) -> Tables:
     Those of the full data set take gigabytes. Only the last folder's are kept.
     """
     folder = Path(folder)
-    paths = [folder / f"{table}.json" for table in TABLES]
-    return _shared(folder, tuple((p.stat().st_mtime_ns, p.stat().st_size) if p.is_file() else None for p in paths))
+    return _shared(folder, tuple(file_state(folder / f"{table}.json") for table in TABLES))
+
+
+def file_state(path: Path) -> tuple[int, int] | None:
+    """Return what changes when a file is written, its time in ns and its size; None for no file."""
+    if not path.is_file():
+        return None
+    found = path.stat()
+    return found.st_mtime_ns, found.st_size
 
 
 @functools.lru_cache(maxsize=1)

@@ -44,8 +44,8 @@ def starting_params(
     ]
 
 
-def check_fit(
-    reference: str, shapes: Params, seeds: Sequence[int], *, partly: bool, frozen: Sequence[str] = ()
+def check_origin_params(
+    reference: str, shapes: Params, seeds: Sequence[int], *, partly: bool, frozen: Sequence[str]
 ) -> None:
     """Raise UserError as `starting_params` does, given the shapes of the fresh parameters."""
     for folder, seed in zip(origin_folders(reference, seeds), seeds, strict=True):

@@ -1,6 +1,5 @@
 """The cache of generated examples: identity, damage, failed and simultaneous builds."""
 
-import ast
 import errno
 import json
 import os
@@ -84,52 +83,6 @@ def test_configuration_and_code_are_part_of_the_name(tmp_path, monkeypatch):
     folder = build(tmp_path, one).folder
     monkeypatch.setattr(cache, "source_digest", lambda: "another world")
     assert build(tmp_path, one).folder != folder
-
-
-@pytest.mark.parametrize("library", with_slow(["numpy", "scipy", "shapely", "opencv"], quick=["numpy"]))
-def test_another_version_of_a_library_makes_other_examples(monkeypatch, library):
-    """Images are drawn by OpenCV, road edges merged by shapely."""
-    pytest.importorskip("cv2" if library == "opencv" else library)
-    there, before = cache.importlib.metadata.version, cache.source_digest.__wrapped__()
-    monkeypatch.setattr(
-        cache.importlib.metadata, "version", lambda name: there(name) + (".1" if name.startswith(library) else "")
-    )
-    assert cache.source_digest.__wrapped__() != before
-
-
-@pytest.mark.parametrize(
-    ("other", "same"),
-    [
-        ('"""Doc."""\n\ndef f(x):\n    """Doc."""\n    return x + 1  # why\n', True),
-        ("def f(x):\n    return (x +\n            1)\n", True),
-        ("def f(x):\n    return x + 2\n", False),
-    ],
-)
-def test_the_digest_ignores_comments_and_docstrings(other, same):
-    assert (cache._code("def f(x):\n    return x + 1\n") == cache._code(other)) is same
-
-
-def test_digest_covers_the_world_its_imports_and_the_readers_of_files(monkeypatch):
-    read = []
-    parse = ast.parse
-
-    def spy(source, *args, **kwargs):
-        read.append(source)
-        return parse(source, *args, **kwargs)
-
-    monkeypatch.setattr(ast, "parse", spy)
-    cache.source_digest.__wrapped__()
-    package = ROOT / "tflane_jax"
-    files = (
-        "scene/truth.py",
-        "scene/logs.py",
-        "geometry/poses.py",
-        "files/feather_table.py",
-        "datasets/procedural.py",
-        "world/bev/line_of_sight.py",
-    )
-    for file in files:
-        assert (package / file).read_text() in read, file
 
 
 @pytest.mark.parametrize("damage", ["truncated", "missing", "index", "empty"])

@@ -7,13 +7,10 @@ appears whole or not at all: it is built under a lock beside its final path and 
 
 from __future__ import annotations
 
-import ast
 import contextlib
 import copy
 import errno
-import functools
 import hashlib
-import importlib.metadata
 import json
 import multiprocessing
 import os
@@ -27,11 +24,11 @@ from typing import Any, Protocol
 
 import numpy as np
 
-import tflane_jax
 from tflane_jax.cores import working_cores
 from tflane_jax.datasets.base import FrameInfo, IndexedExamples
 from tflane_jax.datasets.leaves import example_from_leaves
 from tflane_jax.datasets.parallel import fill, frame_leaves, leaf_path
+from tflane_jax.datasets.source_digest import source_digest
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import rename_flushed
 from tflane_jax.files.locks import is_at, take
@@ -42,13 +39,6 @@ _UNUSABLE = (
     *(errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR, errno.EISDIR, errno.EEXIST, errno.ENAMETOOLONG),
     *(errno.ELOOP, errno.EIO, errno.ESTALE),
 )
-
-# Packages whose code determines the examples; `files` reads the maps of recorded logs.
-_SOURCES = ("scene", "geometry", "files", "world", "markers", "datasets")
-# Libraries by which it draws, searches images, merges areas and finds neighbours; OpenCV has several names.
-_OPENCV = ("opencv-python", "opencv-python-headless", "opencv-contrib-python", "opencv-contrib-python-headless")
-_LIBRARIES = ("numpy", "scipy", "shapely", *_OPENCV)
-
 
 _UNGUARDED = (
     'a script builds a dataset outside `if __name__ == "__main__":`, and worker processes import the script: put what '
@@ -127,31 +117,6 @@ def fingerprint(dataset: Cacheable) -> str:
 
 def _kind(dataset: IndexedExamples) -> str:
     return f"{type(dataset).__module__}.{type(dataset).__qualname__}"
-
-
-@functools.cache
-def source_digest() -> str:
-    """Return the hash of the code that makes examples, without comments, docstrings and layout, and of libraries."""
-    package = Path(tflane_jax.__file__).parent
-    found = [path for name in _SOURCES for path in (package / name, *(package / name).rglob("*.py"))]
-    digest = hashlib.sha256()
-    for file in sorted(path for path in found if path.is_file()):
-        digest.update(file.relative_to(package).as_posix().encode() + b"\0")
-        digest.update(_code(file.read_text(encoding="utf-8")).encode() + b"\0")
-    for name in _LIBRARIES:
-        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
-            digest.update(f"{name} {importlib.metadata.version(name)}".encode() + b"\0")
-    return digest.hexdigest()
-
-
-def _code(source: str) -> str:
-    """Return a text of the source that does not depend on comments, docstrings and layout."""
-    tree = ast.parse(source)
-    for node in ast.walk(tree):
-        documented = isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef))
-        if documented and ast.get_docstring(node, clean=False) is not None:
-            node.body = node.body[1:]
-    return ast.dump(tree)
 
 
 class DamagedEntry(Exception):

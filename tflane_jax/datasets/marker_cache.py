@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import UInt8
 
-from tflane_jax.datasets.cache import cache_root, source_digest
+from tflane_jax.datasets.cache import cache_root
+from tflane_jax.datasets.source_digest import source_digest
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import write_json
 from tflane_jax.files.fields import load_json, member, numbers

@@ -36,8 +36,9 @@ def get_config() -> RunConfig:
 def ablations() -> dict[str, RunConfig]:
     """Return the other rows of each table, and variants beyond the paper.
 
-    "uniform" trusts all markers alike (`uniform_fusion`); rows that end in "as_written" are Eq. (3) to the letter. Of
-    the variants, "ungated" only sets c = 1 in Eq. (3), and "everywhere" has no radius.
+    "uniform" trusts all markers alike (`uniform_fusion`); rows that end in "as_written" are Eq. (3) to the letter, and
+    "as_written_near" is that with a radius. Of the variants, "ungated" only sets c = 1 in Eq. (3), and "everywhere" has
+    no radius.
     """
     memory = MARKERS.memory
     assert memory is not None
@@ -54,6 +55,7 @@ def ablations() -> dict[str, RunConfig]:
     }
     written = as_written(MARKERS)
     rows["as_written"] = _tuned(markers=written)
+    rows["as_written_near"] = _tuned(markers=replace(written, radius=MARKERS.radius))
     rows |= {f"{name}_as_written": row for name, row in _tables_2_to_4(written).items()}
     beyond = {
         "cells": _tuned(markers=replace(MARKERS, bev=MarkerRasterConfig())),

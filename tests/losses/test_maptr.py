@@ -238,7 +238,7 @@ def test_a_perfect_prediction_in_any_order_costs_next_to_nothing():
     assert float(report["matching/lines"]) == 2.0
 
 
-@pytest.mark.parametrize(("least_step", "most"), [(1e-6, 2e6), (0.1, 20.0)])
+@pytest.mark.parametrize(("least_step", "most"), [(1e-9, 2e9), (1e-6, 2e6), (0.1, 20.0)])
 def test_coinciding_points_have_a_direction_with_a_bounded_gradient(least_step, most):
     truth = jnp.asarray(np.arange(4.0, dtype=np.float32)[:, None] * [1.0, 0.0])
     lines = truth.at[2].set(truth[1])
@@ -246,6 +246,9 @@ def test_coinciding_points_have_a_direction_with_a_bounded_gradient(least_step, 
     value, gradient = run(lines)
     np.testing.assert_allclose(value, 1.0, atol=0.02)
     assert most / 4 < np.abs(gradient).max() < most
+    # Padding of the truth has no direction either.
+    nowhere = jnp.zeros_like(truth)
+    assert not np.asarray(jax.grad(lambda x: direction_errors(x, nowhere, least_step).sum())(nowhere)).any()
 
 
 def test_the_nearest_order_is_so_in_fractions_of_the_range():

@@ -77,3 +77,10 @@ def test_a_marker_that_exactly_faces_the_camera_has_a_pose(x):
     for solution in invert_pose(AHEAD.camera_from_ego) @ fit.camera_from_marker:
         assert degrees_between(solution, truth) < 0.2
     assert fit.error.max() < 1e-3
+
+
+@pytest.mark.parametrize("corners", [[(10, 10)] * 4, [(10, 10), (20, 10), (30, 10), (40, 10)]])
+def test_corners_of_no_square_have_no_pose(corners):
+    found = solve_square(np.array(corners, float), np.diag([500.0, 500.0, 1.0]), np.eye(4))
+    assert not np.isfinite(found.error).any()
+    assert np.isfinite(found.camera_from_marker).all()

@@ -5,6 +5,7 @@ import datetime
 import json
 import os
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -65,7 +66,7 @@ def saved(tmp_path):
         (lambda r: r.update(frame="ego"), "frame is 'ego'"),
         (lambda r: r.update(markers={}), "markers is of type dict"),
         (lambda r: r["markers"][1].pop("id"), "markers[1] lacks the entry 'id'"),
-        (lambda r: r["markers"][1].update(lanes=[[[0, 0, 0], [1, 0, 0]]] * 1001), "lanes has 1001 entries"),
+        (lambda r: r["markers"][1].update(lanes=[[[0, 0, 0], [1, 0, 0]]] * 1001), "marker 1 has 1001 lanes"),
         (lambda r: r["markers"][1].update(id=1.5), "markers[1]: id is 1.5"),
         (lambda r: r["markers"][1].update(id=float("inf")), "markers[1]: id is inf"),
         (lambda r: r["markers"][1].update(id=float("nan")), "markers[1]: id is nan"),
@@ -187,6 +188,17 @@ def test_other_files_are_refused(tmp_path):
     (tmp_path / "list.json").write_text("[]")
     with pytest.raises(UserError, match="expected a mapping"):
         load_store(tmp_path / "list.json")
+
+
+def test_a_store_that_could_not_be_read_is_not_written(tmp_path):
+    many = lane_map(*(segment(i, [(i, 0), (i, 5)]) for i in range(1001))).segments
+    crowded, tiny = store_of(many, placed((500, 0, 3), ids=[3]), radius=2000.0), store_of(fork(), placed((0, 0, 3)))
+    with pytest.raises(UserError, match="marker 3 has 1001 lanes, expected at most 1000: take those of a smaller"):
+        save_store(crowded, tmp_path / "store.json")
+    too_small = replace(tiny, markers={0: replace(tiny.markers[0], size=0.001)})
+    with pytest.raises(UserError, match=r"marker 0: size is 0\.001 m, expected 0\.01 to 100 m"):
+        save_store(too_small, tmp_path / "store.json")
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_store_that_cannot_be_written_leaves_the_old_one(tmp_path, monkeypatch):

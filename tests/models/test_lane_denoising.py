@@ -15,7 +15,7 @@ from tflane_jax.losses.toponet import TopoNetLossConfig, lane_denoising_losses
 from tflane_jax.models.auxiliary import AUXILIARY
 from tflane_jax.models.bevformer_detr import BevFormerDetrConfig
 from tflane_jax.models.lane_denoising import DenoisingConfig, decode_groups, noised_lanes
-from tflane_jax.scene import CenterlinePrediction, LaneGraph, Prediction, stack_examples
+from tflane_jax.scene import CenterlinePrediction, LaneGraph, MapLines, Prediction, stack_examples
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 
 RANGE = PerceptionRange()
@@ -61,6 +61,15 @@ def test_each_kind_of_noise_leaves_something_as_it_was(change, same):
     assert np.abs(lines - truth).max((1, 2)).min() > 0.01
     for line, true in zip(lines, truth, strict=True):
         np.testing.assert_allclose(same(line), same(true), atol=1e-3)
+
+
+def test_a_ring_keeps_its_form():
+    square = np.array([[0, 0, 0], [6, 0, 0], [6, 3, 0], [0, 3, 0], [0, 0, 0]], np.float32)
+    lines = MapLines.empty(3, 5)
+    lines.points[:2], lines.valid[:2], lines.closed[0] = square, True, True
+    ring, opened, _ = np.asarray(noised(KEY, lines, 3, RANGE, replace(QUIET, straighten=1.0)))
+    np.testing.assert_allclose(ring, square, atol=1e-5)
+    assert np.ptp(opened, axis=0)[0] < 5.9, "a line that only happens to end where it begins has a chord"
 
 
 def test_padding_may_hold_nan_and_sizes_may_differ():

@@ -73,7 +73,7 @@ class MarkerSimulationConfig:
     detection_sigma: Positive = 40.0
     range: Positive = 60.0
     field_of_view: Annotated[float, within(0, 360)] = 120.0
-    frontal: Annotated[float, within(0, 360)] = 60.0
+    frontal: Annotated[float, within(0, 180)] = 60.0
     cameras: tuple[CameraMount, ...] | None = None
     occlusion: Literal["bodies", "line_of_sight", "none"] = "line_of_sight"
     least_seen: Fraction = 0.75

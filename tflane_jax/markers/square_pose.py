@@ -51,6 +51,8 @@ def solve_square(
     Then the prior prefers the one with the smaller (lean / tilt)^2 + (turned / turn)^2 + (error / least error)^2, with
     lean the angle between the marker's y axis and the ego frame's z axis (boards are upright), and
     turned the angle between its z axis and the direction to the camera (boards face the traffic).
+
+    Corners that no square has, as four on a line, have no pose: both are the identity then, with infinite errors.
     """
     cv2 = opencv()
     square = 0.5 * config.size * _SQUARE
@@ -63,6 +65,8 @@ def solve_square(
     if not np.isfinite(turns).all():
         # Exactly from the front OpenCV takes the root of a number that rounding makes negative.
         count, turns, places = _two_poses(cv2, square, seen + _NUDGE)
+    if count == 0:
+        return SquarePose(np.tile(np.eye(4), (2, 1, 1)), np.full(2, np.inf))
     mirror, back = np.array([1.0, -1.0, 1.0]), np.array([1.0, 1.0, -1.0])
     rotation = mirror[:, None] * np.stack([cv2.Rodrigues(turn)[0] for turn in turns]) * back
     poses = pose_matrix(rotation, mirror * places)

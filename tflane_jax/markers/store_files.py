@@ -37,13 +37,15 @@ _SHORTEST = 0.0005
 
 
 def save_store(store: MarkerStore, path: Path, *, frame: Literal["marker", "survey"] = "marker") -> Path:
-    """Write a store atomically; raises UserError if that fails.
+    """Write a store atomically; raises UserError if that fails, or a marker could not be read from the file.
 
     Args:
         store: what to write.
         path: a .json file, replaced where there is one.
         frame: of the lanes in the file: the marker frame, or the frame of the survey.
     """
+    for marker in store.markers.values():
+        _check_sizes(f"marker {marker.marker_id}", marker.size, len(marker.lanes))
     records = [
         {
             "id": marker.marker_id,
@@ -111,11 +113,8 @@ def _read_marker(entry: Any, number: int, unit: float, frame: str, where: str) -
     if isinstance(side, bool):
         raise UserError(f"{where}: size is {side}, expected a number")
     size = unit * float(numbers(side, (), f"{where}: size"))
-    if not BOARD_SIZES[0] <= size <= BOARD_SIZES[1]:
-        raise UserError(f"{where}: size is {size:g} m, expected {BOARD_SIZES[0]:g} to {BOARD_SIZES[1]:g} m")
     listed = items(entry, "lanes", where)
-    if len(listed) > _MOST_LANES:
-        raise UserError(f"{where}: lanes has {len(listed)} entries, expected at most {_MOST_LANES} around a marker")
+    _check_sizes(where, size, len(listed))
     lanes = unit * numbers(listed, (None, None, 3), f"{where}: lanes")
     _within(lanes, _MAP if frame == "survey" else _LANES, f"{where}: lanes")
     if len(lanes) and lanes.shape[1] < 2:
@@ -138,6 +137,13 @@ def _read_marker(entry: Any, number: int, unit: float, frame: str, where: str) -
     if surveyed and expires and expires <= surveyed:
         raise UserError(f"{where}: expires is {expires}, which must be after surveyed, {surveyed}")
     return StoredMarker(number, pose, lanes, successor, size, surveyed, expires)
+
+
+def _check_sizes(where: str, size: float, lanes: int) -> None:
+    if not BOARD_SIZES[0] <= size <= BOARD_SIZES[1]:
+        raise UserError(f"{where}: size is {size:g} m, expected {BOARD_SIZES[0]:g} to {BOARD_SIZES[1]:g} m")
+    if lanes > _MOST_LANES:
+        raise UserError(f"{where} has {lanes} lanes, expected at most {_MOST_LANES}: take those of a smaller radius")
 
 
 def _one_of(record: Any, name: str, allowed: Sequence[str], where: str) -> str:

@@ -53,7 +53,7 @@ class GtnEncoderConfig:
         channels: meta-paths; the features are split evenly over them.
         relations: structural edge types to select from.
         similarity: attention over all cells as an additional, last edge type: offered to the last hop only, to every
-            hop (one attention each), or to none (None), for a purely structural graph.
+            hop (the same attention), or to none (None), for a purely structural graph.
         heads: of similarity; one head for all channels is cheapest.
         head_dim: channels of query and key of a head, as in LSTR's attention.
         hidden: hidden channels of the feed-forward network.

@@ -32,7 +32,8 @@ class DenoisingConfig:
         shift: standard deviation of a lane's translation along x and y, metres.
         turn: standard deviation of its rotation about its mean point, radians.
         stretch: standard deviation of the logarithm of its scale.
-        straighten: upper limit of the uniform weight with which a lane is blended with the chord between its ends.
+        straighten: upper limit of the uniform weight with which a lane is blended with the chord between its ends. A
+            ring has none and keeps its form.
     """
 
     copies: Count = 2
@@ -101,12 +102,17 @@ def noised_lanes(
     """Return the first `count` lanes noised, metres; in place of padding, random straight lanes in the range."""
     shift, turn, stretch, bend, place, way = jax.random.split(key, 6)
     truth = jnp.where(lanes.valid[:, None, None], lanes.points, 0.0)[:count]
-    truth = jnp.pad(truth, ((0, count - len(truth)), (0, 0), (0, 0)))
-    valid = jnp.pad(lanes.valid[:count], (0, count - len(lanes.valid[:count])))
+    spare = count - len(truth)
+    truth = jnp.pad(truth, ((0, spare), (0, 0), (0, 0)))
+    valid = jnp.pad(lanes.valid[:count], (0, spare))
     fraction = jnp.linspace(0.0, 1.0, truth.shape[1])[None, :, None]
     # Partly straightened, so that the decoder learns to bend lanes.
     chord = truth[:, :1] + fraction * (truth[:, -1:] - truth[:, :1])
-    truth = truth + noise.straighten * jax.random.uniform(bend, (count, 1, 1)) * (chord - truth)
+    weight = noise.straighten * jax.random.uniform(bend, (count, 1, 1))
+    if isinstance(lanes, MapLines):
+        # The chord of a ring is a point.
+        weight = jnp.where(jnp.pad(lanes.closed[:count], (0, spare))[:, None, None], 0.0, weight)
+    truth = truth + weight * (chord - truth)
     middle = truth.mean(1, keepdims=True)
     size = jnp.exp(noise.stretch * jax.random.normal(stretch, (count, 1, 1)))
     angle = noise.turn * jax.random.normal(turn, (count,))

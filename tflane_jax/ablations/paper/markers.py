@@ -210,6 +210,7 @@ _ON_EVIDENCE = (
             ),
             ("DET_l", "TOP_ll", "TOP_lt", "OLS"),
             {"TopoNet": (28.5, 4.1, 20.6, 34.7), _WRITTEN.name: (36.2, 8.8, 22.6, 40.5)},
+            minutes=18.7,
         ),
         seeds=_FEWER_SEEDS,
         note=_EVIDENCE_NOTE + _FORMS_NOTE,

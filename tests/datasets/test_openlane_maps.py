@@ -108,6 +108,16 @@ def test_lines_that_part_or_run_against_each_other_are_different():
     assert same_lines([], [straight]) == {}
 
 
+def test_lines_that_come_and_go_take_no_other_line_its_place():
+    """One of two lanes stays and the other is replaced: pairing both crosswise would be the shorter sum."""
+    before, now = ([np.array([[0.0, y, 0.0], [30.0, y, 0.0]]) for y in of_frame] for of_frame in ((0, 10), (0.3, -10)))
+    assert same_lines(now, before) == {0: 0}
+    ids, valid = Identities(), np.ones(2, bool)
+    first, second = (ids._next("lane", np.stack(lines), None, valid, np.eye(4)) for lines in (before, now))
+    assert second[0] == first[0]
+    assert second[1] not in first.values()
+
+
 def _short(name, field, points):
     """Return damage: the first lane or edge of every frame is as short as where the border cuts off a corner."""
 

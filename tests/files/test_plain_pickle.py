@@ -35,6 +35,9 @@ def test_plain_data_survives(tmp_path, protocol):
     assert got["objects"].tolist() == [[1, 2], None]
     (detection,) = got["results"]["val", "10073", "315"]
     np.testing.assert_array_equal(detection["points"], [[0, 1, 2], [3, 4, 5]])
+    again = pickle.loads(pickle.dumps(got, protocol))
+    assert all(type(array) is np.ndarray for array in again["arrays"])
+    np.testing.assert_array_equal(again["text arrays"], PLAIN["text arrays"])
 
 
 class Evil:
@@ -105,3 +108,58 @@ def test_a_file_with_a_second_object_is_refused(tmp_path, protocol):
 def test_a_missing_file_is_named(tmp_path):
     with pytest.raises(UserError, match=r"cannot read .*nowhere\.pkl"):
         load_plain_pickle(tmp_path / "nowhere.pkl")
+
+
+class Forged:
+    """A numpy type with a state of the file's choice, or what a file calls with one."""
+
+    def __init__(self, function, arguments, *state):
+        self.call = (function, arguments, *state)
+
+    def __reduce__(self):
+        return self.call
+
+
+def forged_type(code, names=None, fields=None, size=-1, flags=0):
+    return Forged(np.dtype, (code, False, True), (3, "|", None, names, fields, size, -1, flags))
+
+
+def forged_scalar(kind, data=b"A" * 16):
+    return Forged(np._core.multiarray.scalar, (kind, data))
+
+
+def forged_array(kind, shape, data):
+    function, arguments, _ = np.zeros(1).__reduce__()
+    return Forged(function, arguments, (1, shape, kind, False, data))
+
+
+@pytest.mark.parametrize(
+    "thing",
+    [
+        forged_scalar(forged_type("O8")),
+        forged_scalar(forged_type("O8", flags=63)),
+        forged_array(forged_type("O8"), (2,), b"A" * 16),
+        forged_array(forged_type("O8", flags=63), (3,), [1, 2]),
+        forged_array(forged_type("f8"), (2**40,), b"A" * 16),
+        forged_array(forged_type("f8"), (2,), [1.0, 2.0]),
+        forged_array(np.dtype("f8"), (2, -1), b"A" * 16),
+        forged_scalar(forged_type("f8", size=2**20)),
+        forged_scalar(forged_type("(100000,)f8")),
+        forged_scalar(forged_type("f8", ("a",), {"a": (np.dtype("O"), 0)})),
+    ],
+    ids=range(10),
+)
+def test_numpy_types_are_not_completed_by_the_file(tmp_path, thing):
+    """Such states make numpy read beyond the data, or take them for addresses of objects."""
+    path = tmp_path / "data.pkl"
+    for protocol in (2, 4):
+        path.write_bytes(pickle.dumps([thing], protocol))
+        with pytest.raises(UserError, match=r"data\.pkl is (refused|no pickle file)"):
+            load_plain_pickle(path)
+
+
+@pytest.mark.parametrize("fields", [{"a": (np.dtype("O"), 0)}, {"a": (np.dtype("f8"), -4096)}])
+def test_records_are_read_without_their_fields(tmp_path, fields):
+    path = tmp_path / "data.pkl"
+    path.write_bytes(pickle.dumps(forged_scalar(forged_type("V16", ("a",), fields, 16)), 2))
+    assert load_plain_pickle(path).dtype == np.dtype("V16")

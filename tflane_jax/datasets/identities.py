@@ -71,7 +71,8 @@ class Identities:
         before, names = self._before.get(kind, _Kind()), {}
         if len(rows) and len(before.names):
             cost = _separation(now, _Kind(transform_points(moved, before.lines), before.label))
-            for row, column in zip(*linear_sum_assignment(cost), strict=True):
+            # Items that are not the same are so alike: the distances of such pairs would decide about the others.
+            for row, column in zip(*linear_sum_assignment(np.minimum(cost, _SAME)), strict=True):
                 if cost[row, column] < _SAME:
                     names[row] = before.names[column]
         for row in range(len(rows)):

@@ -204,7 +204,8 @@ def same_lines(now: Sequence[np.ndarray], before: Sequence[np.ndarray]) -> dict[
     apart = np.minimum(there.mean(-1), back) + 1e-3 * np.maximum(there.mean(-1), back)
     # The same direction.
     apart = np.where(place[..., -1] >= place[..., 0], apart, 1e6)
-    pairs = zip(*linear_sum_assignment(apart), strict=True)
+    # Lines that are not the same are so alike: the distances of such pairs would decide about the others.
+    pairs = zip(*linear_sum_assignment(np.minimum(apart, _SAME)), strict=True)
     return {int(i): int(j) for i, j in pairs if apart[i, j] < _SAME}
 
 

@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import collections
 import io
+import math
 import pickle
 import pickletools
+import re
 import reprlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -19,6 +21,9 @@ from typing import IO, Any, Literal, NamedTuple
 import numpy as np
 
 from tflane_jax.errors import UserError
+
+# Truth values, numbers, strings, objects, dates and records.
+_CODE = re.compile(r"[<>=|]?(\?|[biufcSUOMmV]\d{0,6})")
 
 
 def load_plain_pickle(path: Path) -> Any:
@@ -105,11 +110,62 @@ def _check_instructions(file: IO[bytes]) -> None:
     file.seek(start)
 
 
+class _Type:
+    """A type of numpy, as a file names and then completes it.
+
+    The file never gets hold of a `np.dtype`: numpy takes its state from a pickle unchecked, also places of fields
+    outside the data, and objects that the data hold as bare addresses. Records lose their fields and dates their unit:
+    who reads a file expects neither, and says that they are there.
+    """
+
+    def __init__(self, code: Any) -> None:
+        if not isinstance(code, str) or _CODE.fullmatch(code) is None:
+            raise Refused(f"numpy data of the type {reprlib.repr(code)}")
+        self.dtype = np.dtype(code)
+
+    def __setstate__(self, state: Any) -> None:
+        # Version, order of bytes, form of an element, names and form of fields, then size, alignment and flags.
+        match state:
+            case (int(), "<" | ">" | "=" | "|" as order, None, names, fields, int(size), *_) if size in (
+                -1,
+                self.dtype.itemsize,
+            ) and (self.dtype.kind == "V" or names is fields is None):
+                self.dtype = self.dtype.newbyteorder("=" if order == "|" else order)
+            case _:
+                raise pickle.UnpicklingError("numpy data have an unknown form")
+
+
+class _FilledArray(np.ndarray):
+    """An array that the file fills once it exists."""
+
+    def __repr__(self) -> str:
+        return repr(self.view(np.ndarray))
+
+    def __reduce_ex__(self, protocol: Any) -> Any:
+        return self.view(np.ndarray).__reduce_ex__(protocol)
+
+    def __setstate__(self, state: Any) -> None:
+        match state:
+            case (*version, tuple(shape), _Type() as kind, bool() | int() as by_column, data) if version in ([], [1]):
+                data = data.encode("latin1") if isinstance(data, str) else data
+                if isinstance(data, list) != kind.dtype.hasobject:
+                    raise pickle.UnpicklingError("an array and its content have different types")
+                if isinstance(data, list) and len(data) != math.prod(shape):
+                    raise pickle.UnpicklingError(f"an array of shape {shape} has {len(data)} elements")
+                form: Any = bool(by_column)  # its stub asks for numpy's own, which it refuses
+                super().__setstate__((1, shape, kind.dtype, form, data))
+            case _:
+                raise pickle.UnpicklingError("an array has an unknown form")
+
+
+_FilledArray.__name__ = "ndarray"  # what messages name it
+
+
 def _array(kind: type, shape: Any, code: Any) -> np.ndarray:
     """Return the empty array that the file then fills; `shape` and `code` of the file are placeholders, so ignored."""
     if kind != _NDARRAY:
         raise Refused(f"an array of type {reprlib.repr(kind)}")
-    return np.ndarray.__new__(np.ndarray, (0,), "b")
+    return _FilledArray.__new__(_FilledArray, (0,), "b")
 
 
 def _bytes(text: str | bytes = b"", encoding: str = "latin1") -> bytes:
@@ -123,18 +179,24 @@ def _bytearray(text: str | bytes = b"", encoding: str = "latin1") -> bytearray:
     return bytearray(_bytes(text, encoding))
 
 
-def _dtype(code: str, align: bool = False, copy: bool = True) -> np.dtype:
-    """Return a new type, which the file then completes."""
-    return np.dtype(code, align=bool(align), copy=True)
+def _dtype(code: Any, *_: Any) -> _Type:
+    return _Type(code)
 
 
-def _scalar(dtype: np.dtype, data: bytes = b"") -> Any:
-    return np.frombuffer(data, dtype, 1)[0]
+def _scalar(kind: _Type, data: bytes = b"") -> Any:
+    return np.frombuffer(data, _plain(kind), 1)[0]
 
 
-def _from_buffer(buffer: Any, dtype: np.dtype, shape: tuple[int, ...], order: Literal["C", "F"]) -> np.ndarray:
+def _from_buffer(buffer: Any, kind: _Type, shape: tuple[int, ...], order: Literal["C", "F"]) -> np.ndarray:
     """Return an array stored inside the file, as by protocol 5."""
-    return np.frombuffer(buffer, dtype).reshape(shape, order=order)
+    return np.frombuffer(buffer, _plain(kind)).reshape(shape, order=order)
+
+
+def _plain(kind: _Type) -> np.dtype:
+    """Return the type of elements that bytes may be read as."""
+    if kind.dtype.hasobject:
+        raise Refused("objects stored as bytes")
+    return kind.dtype
 
 
 # Not the class itself: a file could call it with a shape of any size.

@@ -124,6 +124,16 @@ def test_openlane_folders_on_the_command_line(tmp_path, capsys):
     assert written["meta"]["worst"][0]["nearest"] == "00001"
 
 
+def test_openlane_folders_may_hold_lane_segments_alone(tmp_path):
+    write_segment(tmp_path, "00001", [0, 0, 1], [10, 0, 1])
+    both = read_drives(tmp_path)
+    for i in range(2):
+        (tmp_path / "00001" / "info" / f"{i}.json").replace(tmp_path / "00001" / "info" / f"{i}-ls.json")
+    (alone,) = read_drives(tmp_path)
+    assert alone.name == both[0].name
+    np.testing.assert_array_equal(alone.positions, both[0].positions)
+
+
 @pytest.mark.parametrize(
     ("pose", "message"),
     [

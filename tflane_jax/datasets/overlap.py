@@ -43,18 +43,19 @@ class DrivenPath:
 
 
 def read_drives(root: Path) -> list[DrivenPath]:
-    """Return the drives of a folder of Argoverse 2 logs, or of OpenLane-V2 (`<segment>/info/<timestamp>.json`).
+    """Return the drives of a folder of Argoverse 2 logs, or of OpenLane-V2.
 
-    OpenLane-V2's files do not name the city.
+    Its files, `<segment>/info/<timestamp>.json` and `<timestamp>-ls.json`, do not name the city.
 
     Raises:
         UserError: the folder holds neither, or a file cannot be read.
     """
     root = Path(root)
-    files = sorted(p for p in root.glob("**/info/*.json") if not p.stem.endswith("-ls"))
-    if files:
+    # A frame has one of both files or, with the same pose, both; the later one, without "-ls", is then read.
+    files = sorted(root.glob("**/info/*.json"))
+    if frames := {file.with_stem(file.stem.removesuffix("-ls")): file for file in files}:
         drives: dict[Path, list[np.ndarray]] = {}
-        for file in files:
+        for _, file in sorted(frames.items()):
             pose = member(load_members(file, ("pose",)), "pose", str(file))
             where = numbers(member(pose, "translation", f"{file}: pose"), (3,), f"{file}: pose.translation")
             drives.setdefault(file.parent.parent, []).append(where[:2])

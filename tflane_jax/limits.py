@@ -113,8 +113,8 @@ LARGEST_SEED = 2**32 - 1
 Seed = Annotated[int, counted(0, LARGEST_SEED)]
 Positive = Annotated[float, above(0)]
 PositiveOrZero = Annotated[float, at_least(0)]
-# Added to what a loss divides by; its fourth power is still a number in float32.
-Small = Annotated[float, at_least(1e-9)]
+# The least that a loss divides by: in float32 its fourth power is not rounded to 0.
+Divisor = Annotated[float, at_least(1e-9)]
 PositiveOrInfinite = Annotated[float, Limit("above 0, or inf", lambda value: value > 0, finite=False)]
 Fraction = Annotated[float, within(0, 1)]
 """A fraction or a probability."""

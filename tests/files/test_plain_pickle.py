@@ -133,27 +133,26 @@ def forged_array(kind, shape, data):
     return Forged(function, arguments, (1, shape, kind, False, data))
 
 
-@pytest.mark.parametrize(
-    "thing",
-    [
-        forged_scalar(forged_type("O8")),
-        forged_scalar(forged_type("O8", flags=63)),
-        forged_array(forged_type("O8"), (2,), b"A" * 16),
-        forged_array(forged_type("O8", flags=63), (3,), [1, 2]),
-        forged_array(forged_type("f8"), (2**40,), b"A" * 16),
-        forged_array(forged_type("f8"), (2,), [1.0, 2.0]),
-        forged_array(np.dtype("f8"), (2, -1), b"A" * 16),
-        forged_scalar(forged_type("f8", size=2**20)),
-        forged_scalar(forged_type("(100000,)f8")),
-        forged_scalar(forged_type("f8", ("a",), {"a": (np.dtype("O"), 0)})),
-    ],
-    ids=range(10),
-)
-def test_numpy_types_are_not_completed_by_the_file(tmp_path, thing):
+FORGED = {
+    "an address as object": forged_scalar(forged_type("O8")),
+    "an address as counted object": forged_scalar(forged_type("O8", flags=63)),
+    "addresses in an array": forged_array(forged_type("O8"), (2,), b"A" * 16),
+    "too few objects": forged_array(forged_type("O8", flags=63), (3,), [1, 2]),
+    "too few bytes": forged_array(forged_type("f8"), (2**40,), b"A" * 16),
+    "objects in place of bytes": forged_array(forged_type("f8"), (2,), [1.0, 2.0]),
+    "a negative shape": forged_array(np.dtype("f8"), (2, -1), b"A" * 16),
+    "a number larger than its type": forged_scalar(forged_type("f8", size=2**20)),
+    "an array as type": forged_scalar(forged_type("(100000,)f8")),
+    "a number with fields": forged_scalar(forged_type("f8", ("a",), {"a": (np.dtype("O"), 0)})),
+}
+
+
+@pytest.mark.parametrize("name", FORGED)
+def test_numpy_types_are_not_completed_by_the_file(tmp_path, name):
     """Such states make numpy read beyond the data, or take them for addresses of objects."""
     path = tmp_path / "data.pkl"
     for protocol in (2, 4):
-        path.write_bytes(pickle.dumps([thing], protocol))
+        path.write_bytes(pickle.dumps([FORGED[name]], protocol))
         with pytest.raises(UserError, match=r"data\.pkl is (refused|no pickle file)"):
             load_plain_pickle(path)
 

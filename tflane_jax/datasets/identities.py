@@ -62,8 +62,6 @@ class Identities:
     def _next(
         self, kind: str, lines: np.ndarray, label: np.ndarray | None, valid: Bool[np.ndarray, " n"], moved: np.ndarray
     ) -> dict[int, str]:
-        from scipy.optimize import linear_sum_assignment
-
         rows = np.flatnonzero(valid)
         now = _Kind(
             np.asarray(lines, np.float64)[rows], np.zeros(len(rows), int) if label is None else np.asarray(label)[rows]
@@ -71,10 +69,7 @@ class Identities:
         before, names = self._before.get(kind, _Kind()), {}
         if len(rows) and len(before.names):
             cost = _separation(now, _Kind(transform_points(moved, before.lines), before.label))
-            # Items that are not the same are so alike: the distances of such pairs would decide about the others.
-            for row, column in zip(*linear_sum_assignment(np.minimum(cost, _SAME)), strict=True):
-                if cost[row, column] < _SAME:
-                    names[row] = before.names[column]
+            names = {row: before.names[column] for row, column in pairs_within(cost, _SAME).items()}
         for row in range(len(rows)):
             if row not in names:
                 names[row] = str(self._count)
@@ -82,6 +77,18 @@ class Identities:
         now.names = [names[row] for row in range(len(rows))]
         self._before[kind] = now
         return {int(place): now.names[row] for row, place in enumerate(rows)}
+
+
+def pairs_within(apart: Float[np.ndarray, "n m"], limit: float) -> dict[int, int]:
+    """Return the column of each row that has one nearer than a limit.
+
+    The pairs have the least sum of distances, where all pairs beyond the limit count alike: how far items are that came
+    or went does not matter to those that stay.
+    """
+    from scipy.optimize import linear_sum_assignment
+
+    pairs = zip(*linear_sum_assignment(np.minimum(apart, limit)), strict=True)
+    return {int(row): int(column) for row, column in pairs if apart[row, column] < limit}
 
 
 def _separation(now: _Kind, before: _Kind) -> Float[np.ndarray, "n m"]:

@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
+from tflane_jax.datasets.identities import pairs_within
 from tflane_jax.datasets.lane_outlines import LaneOutline, boundaries
 from tflane_jax.datasets.openlane_annotation import Annotation, read_annotation
 from tflane_jax.datasets.openlane_frames import frame_pose
@@ -194,8 +195,6 @@ def same_lines(now: Sequence[np.ndarray], before: Sequence[np.ndarray]) -> dict[
 
     A line may be cut shorter: the smaller one of the mean distances from one to the other counts.
     """
-    from scipy.optimize import linear_sum_assignment
-
     if not len(now) or not len(before):
         return {}
     ours, theirs = (resample_lines(list(lines), _POINTS) for lines in (now, before))
@@ -204,9 +203,7 @@ def same_lines(now: Sequence[np.ndarray], before: Sequence[np.ndarray]) -> dict[
     apart = np.minimum(there.mean(-1), back) + 1e-3 * np.maximum(there.mean(-1), back)
     # The same direction.
     apart = np.where(place[..., -1] >= place[..., 0], apart, 1e6)
-    # Lines that are not the same are so alike: the distances of such pairs would decide about the others.
-    pairs = zip(*linear_sum_assignment(np.minimum(apart, _SAME)), strict=True)
-    return {int(i): int(j) for i, j in pairs if apart[i, j] < _SAME}
+    return pairs_within(apart, _SAME)
 
 
 def joined(before: Float[np.ndarray, "n 3"], after: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, "k 3"]:

@@ -51,7 +51,7 @@ def read_drives(root: Path) -> list[DrivenPath]:
         UserError: the folder holds neither, or a file cannot be read.
     """
     root = Path(root)
-    # A frame has one of both files or, with the same pose, both; the later one, without "-ls", is then read.
+    # Where a frame has both files, which hold the same pose, the one without "-ls" is read: it sorts last.
     files = sorted(root.glob("**/info/*.json"))
     if frames := {file.with_stem(file.stem.removesuffix("-ls")): file for file in files}:
         drives: dict[Path, list[np.ndarray]] = {}

@@ -35,9 +35,10 @@ def source_digest() -> str:
 
 
 def _code(source: str) -> str:
-    """Return a text of the source's instructions, which know no comments, words of docstrings, line breaks and asserts.
+    """Return the compiled program of a source as text; each version of Python has its own.
 
-    It is of one version of Python. Parsing into nodes and writing those takes twice as long, a second for all files.
+    Comments, asserts, line breaks and what docstrings say are no part of it. `ast.dump` would take twice as long: a
+    second for all files.
     """
     return repr(_instructions(compile(source, "", "exec", dont_inherit=True, optimize=2)))
 
@@ -51,5 +52,5 @@ def _instructions(code: types.CodeType) -> tuple[Any, ...]:
 def _constant(value: Any) -> Any:
     if isinstance(value, types.CodeType):
         return _instructions(value)
-    # The order in a set of strings is another one in every process.
+    # Each process keeps a set of strings in another order.
     return sorted(map(repr, value)) if isinstance(value, frozenset) else value

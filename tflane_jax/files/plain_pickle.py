@@ -113,26 +113,26 @@ def _check_instructions(file: IO[bytes]) -> None:
 class _Type:
     """A type of numpy, as a file names and then completes it.
 
-    The file never gets hold of a `np.dtype`: numpy takes its state from a pickle unchecked, also places of fields
-    outside the data, and objects that the data hold as bare addresses. Records lose their fields and dates their unit:
-    who reads a file expects neither, and says that they are there.
+    A file could complete a `np.dtype` so that numpy reads outside the data, or takes numbers for addresses of objects:
+    numpy does not check the state that a pickle gives it. Records lose their fields here and dates their unit. No
+    reader expects either, and each still sees from the type that it got one.
     """
 
-    def __init__(self, code: Any) -> None:
+    def __init__(self, code: Any, *_: Any) -> None:
         if not isinstance(code, str) or _CODE.fullmatch(code) is None:
             raise Refused(f"numpy data of the type {reprlib.repr(code)}")
         self.dtype = np.dtype(code)
 
     def __setstate__(self, state: Any) -> None:
-        # Version, order of bytes, form of an element, names and form of fields, then size, alignment and flags.
         match state:
-            case (int(), "<" | ">" | "=" | "|" as order, None, names, fields, int(size), *_) if size in (
-                -1,
-                self.dtype.itemsize,
-            ) and (self.dtype.kind == "V" or names is fields is None):
-                self.dtype = self.dtype.newbyteorder("=" if order == "|" else order)
+            # Version, order of bytes, form of an element, names and form of fields, size; then alignment and flags.
+            case (int(), "<" | ">" | "=" | "|" as order, None, names, fields, int(size), *_):
+                known = size in (-1, self.dtype.itemsize) and (self.dtype.kind == "V" or names is fields is None)
             case _:
-                raise pickle.UnpicklingError("numpy data have an unknown form")
+                known, order = False, "|"
+        if not known:
+            raise pickle.UnpicklingError("numpy data have an unknown form")
+        self.dtype = self.dtype.newbyteorder("=" if order == "|" else order)
 
 
 class _FilledArray(np.ndarray):
@@ -179,10 +179,6 @@ def _bytearray(text: str | bytes = b"", encoding: str = "latin1") -> bytearray:
     return bytearray(_bytes(text, encoding))
 
 
-def _dtype(code: Any, *_: Any) -> _Type:
-    return _Type(code)
-
-
 def _scalar(kind: _Type, data: bytes = b"") -> Any:
     return np.frombuffer(data, _plain(kind), 1)[0]
 
@@ -214,7 +210,7 @@ _BUILTINS = {
 }
 PLAIN: Mapping[tuple[str, str], Any] = {
     ("numpy", "ndarray"): _NDARRAY,
-    ("numpy", "dtype"): Sealed(_dtype),
+    ("numpy", "dtype"): Sealed(_Type),
     ("collections", "OrderedDict"): collections.OrderedDict,
     ("_codecs", "encode"): Sealed(_bytes),
     # Python 2 and 3, numpy 1 and 2 have them in different modules.

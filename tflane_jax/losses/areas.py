@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.geometry.line_orders import Ways, point_orders
-from tflane_jax.limits import PositiveOrZero, Small
+from tflane_jax.limits import Divisor, PositiveOrZero
 from tflane_jax.losses.common import Report
 from tflane_jax.losses.maptr import LineTargets, MapTrLossConfig, line_loss
 from tflane_jax.scene import AreaPrediction, Areas, AreaType, LinePrediction
@@ -40,7 +40,7 @@ class AreaLossConfig:
     class_weight: PositiveOrZero = 1.5
     points_weight: PositiveOrZero = 0.025
     direction_weight: PositiveOrZero = 0.005
-    least_step: Small = 1e-6
+    least_step: Divisor = 1e-6
     rings: Ways = "one"
     class_target: Literal["one", "quality"] = "one"
 

@@ -12,7 +12,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float
 
 from tflane_jax.geometry.lane_shapes import curve_columns
-from tflane_jax.limits import PositiveOrZero, Small
+from tflane_jax.limits import Divisor, PositiveOrZero
 from tflane_jax.losses.common import Report, matched
 from tflane_jax.matching import Assignment, match
 from tflane_jax.models.auxiliary import AuxiliaryOutputs
@@ -41,7 +41,7 @@ class LaneShapeLossConfig:
     extent_weight: PositiveOrZero = 2.0
     cell_weight: PositiveOrZero = 10.0
     shared_horizon: bool = True
-    least_depth: Small = 1e-6
+    least_depth: Divisor = 1e-6
     matcher: Literal["scipy", "jax"] = "jax"
 
     def loss(

@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float, Int
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.geometry.line_orders import Ways, point_orders
-from tflane_jax.limits import Fraction, PositiveOrZero, Small
+from tflane_jax.limits import Divisor, Fraction, PositiveOrZero
 from tflane_jax.losses.auxiliary import denoising_pairs
 from tflane_jax.losses.common import (
     HostLossConfig,
@@ -58,7 +58,7 @@ class MapTrLossConfig(HostLossConfig):
     class_weight: PositiveOrZero = 2.0
     points_weight: PositiveOrZero = 5.0
     direction_weight: PositiveOrZero = 0.005
-    least_step: Small = 1e-6
+    least_step: Divisor = 1e-6
     alpha: Fraction = 0.25
     gamma: PositiveOrZero = 2.0
     rings: Ways = "one"

@@ -1,4 +1,4 @@
-"""Metrics of lanes and map lines do not depend on where the axes point."""
+"""What metrics of lanes and map lines do not depend on: where the axes point, and the scale of topology scores."""
 
 import dataclasses
 
@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.metrics.cases import random_frame
+from tests.metrics.cases import hand_frame, random_frame
 from tflane_jax.metrics import CenterlineMetrics, MapDetections, MapTruth, VectorMapMetrics
 from tflane_jax.metrics.centerline_matching import nearest_lanes
 from tflane_jax.metrics.frames import checked_lines
@@ -58,3 +58,16 @@ def test_map_lines_may_be_moved_and_mirrored(seed, angle, mirrored, sampling):
     assert found == pytest.approx(expected, rel=1e-9, nan_ok=True)
     expected, found = (match_map(*each, sampling).distance for each in (frame, other))
     np.testing.assert_allclose(found, expected, rtol=1e-9)
+
+
+def test_topology_above_1_counts_by_its_order():
+    """Sums, as TopoLogic's, score as the probabilities of the same order."""
+
+    def stretched(scores):
+        return np.where(np.asarray(scores) > 0.5, 9.0 * np.asarray(scores), scores)
+
+    detections, truth = hand_frame()
+    assert np.max(detections.successor) > 0.5
+    elements = dataclasses.replace(detections.elements, lane=stretched(detections.elements.lane))
+    sums = dataclasses.replace(detections, successor=stretched(detections.successor), elements=elements)
+    assert score(CenterlineMetrics(), sums, truth) == score(CenterlineMetrics(), detections, truth)

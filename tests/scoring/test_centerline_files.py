@@ -49,12 +49,18 @@ def test_files_give_the_official_numbers(tmp_path, protocol):
         assert written["rows"][0][number] == pytest.approx(official[number], abs=1e-6), number
 
 
-def test_a_folder_of_annotations_gives_the_same(files):
-    for split, segment, timestamp in FRAMES:
-        info = files / "data" / split / segment / "info"
+def write_info(data, keys, annotated=True):
+    for split, segment, timestamp in keys:
+        info = data / split / segment / "info"
         info.mkdir(parents=True, exist_ok=True)
-        (info / f"{timestamp}.json").write_text(json.dumps({"annotation": centerline_annotation(TRUTH)}))
-        (info / f"{timestamp}-ls.json").write_text("the other task's file")
+        annotation = {"annotation": centerline_annotation(TRUTH)} if annotated else {}
+        (info / f"{timestamp}.json").write_text(json.dumps(annotation))
+
+
+def test_a_folder_of_annotations_gives_the_same(files):
+    write_info(files / "data", FRAMES)
+    for file in (files / "data").rglob("info/*.json"):
+        file.with_name(f"{file.stem}-ls.json").write_text("the other task's file")
     assert run(files)[1]["rows"] == run(files, truth="data")[1]["rows"]
     # A split's own folder will do.
     assert run(files)[1]["rows"] == run(files, truth="data/val")[1]["rows"]
@@ -62,14 +68,33 @@ def test_a_folder_of_annotations_gives_the_same(files):
 
 def test_of_a_dataset_the_predicted_splits_alone_are_read(files, capsys):
     for split in ("train", "val", "test"):  # frames of the test have no annotation
-        for _, segment, timestamp in FRAMES:
-            info = files / "data" / split / segment / "info"
-            info.mkdir(parents=True, exist_ok=True)
-            annotated = {} if split == "test" else {"annotation": centerline_annotation(TRUTH)}
-            (info / f"{timestamp}.json").write_text(json.dumps(annotated))
+        write_info(files / "data", [(split, *frame) for _, *frame in FRAMES], annotated=split != "test")
     assert run(files)[1]["rows"] == run(files, truth="data")[1]["rows"]
     assert run(files, truth="data/train")[0] == 2
     assert "data/train holds no annotations of split val" in capsys.readouterr().err
+
+
+def data_dict(folder, subset, keys):
+    segments = {}
+    for _, segment, timestamp in keys:
+        segments.setdefault(segment, []).append(f"{timestamp}.json")
+    (folder / f"data_dict_subset_{subset}.json").write_text(json.dumps({"train": {}, "val": segments}))
+
+
+def test_of_a_dataset_the_predicted_subset_alone_is_read(files, capsys):
+    """Both subsets may share the folder; a frame that the predictions lack is missed within their own."""
+    other = [("val", "11000", "5"), ("val", "11000", "6")]
+    write_info(files / "data", [*FRAMES, *other])
+    data_dict(files / "data", "A", FRAMES)
+    data_dict(files / "data", "B", other)
+    for truth in ("data", "data/val"):
+        assert run(files)[1]["rows"] == run(files, truth=truth)[1]["rows"]
+    write_submission(files / "submission.pkl", dict.fromkeys(FRAMES[:2], DETECTIONS))
+    assert run(files, truth="data")[0] == 2
+    assert "1 of 3 frames are missing from the predictions" in capsys.readouterr().err
+    write_submission(files / "submission.pkl", dict.fromkeys([*FRAMES, *other], DETECTIONS))
+    code, written = run(files, "--by", "scene", truth="data")
+    assert (code, len(written["rows"])) == (0, 1 + len({key[:2] for key in [*FRAMES, *other]}))
 
 
 def test_dense_annotations_are_thinned(files):

@@ -159,6 +159,19 @@ REMARKS = {
         )
         for side in ("predictions", "truth")
     },
+    **{
+        f"topology of {form}s above 1": (
+            Case(
+                form,
+                "predictions",
+                "",
+                "",
+                put("results", KEYS[1], "predictions", matrix, np.array([[0.2, 1.5], [0, 0]])),
+            ),
+            r"predicted topology exceeds 1 in 1 of 3 frames \(frame val/10000/150\), as sums do",
+        )
+        for form, matrix in (("centerline", "topology_lclc"), ("segment", "topology_lsls"))
+    },
     "dense centerlines": (
         Case("centerline", "predictions", "", "", _resampled(201)),
         r"6 of 6 predicted centerlines have other than the official 11 points \(frame val/10000/100, number 0: 201,",

@@ -111,6 +111,25 @@ def test_a_dense_centerline_of_a_segment_is_resampled_along_all_of_its_points(tm
     np.testing.assert_array_equal(truth.lanes.points[0], resample(arc, 10))
 
 
+def test_lines_of_the_dataset_are_always_resampled_those_of_a_collected_file_were(tmp_path):
+    """However many points an annotator drew: the devkit resamples as it collects."""
+    uneven = np.array([[0, 0, 0], *([x, 1, 0] for x in np.linspace(0, 12, 9) ** 1.5)], float)
+    record = segment_record(np.concatenate([uneven, uneven[::-1]]))
+    record["lane_segment"][0] |= dict.fromkeys(("centerline", "left_laneline", "right_laneline"), uneven.tolist())
+    info = tmp_path / "data" / "val" / "1" / "info"
+    info.mkdir(parents=True)
+    (info / "1-ls.json").write_text(json.dumps({"annotation": record}, default=np.ndarray.tolist))
+    (tmp_path / "annotations.pkl").write_bytes(pickle.dumps({("val", "1", "1"): {"annotation": record}}))
+    (raw,) = read_segment_truth(tmp_path / "data").values()
+    (collected,) = read_segment_truth(tmp_path / "annotations.pkl").values()
+    for lines in (raw.lanes.points, raw.left, raw.right):
+        np.testing.assert_array_equal(lines[0], resample(uneven, 10))
+    for lines in (collected.lanes.points, collected.left, collected.right):
+        np.testing.assert_array_equal(lines[0], uneven)
+    assert len(raw.areas.points[0]) == len(collected.areas.points[0]) == 20
+    assert not np.array_equal(raw.areas.points[0], collected.areas.points[0])
+
+
 def typed(record, types, visibility=None):
     (lane,) = record["lane_segment"]
     lane |= dict(zip(("left_laneline_type", "right_laneline_type"), types, strict=True))

@@ -8,11 +8,11 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from tflane_jax.datasets.base import SPLITS, Split
-from tflane_jax.datasets.openlane_frames import SUBSETS, SubsetName, frames_of, subset_of_frame
+from tflane_jax.datasets.openlane_frames import SUBSETS, SubsetName, subset_of_frame
 from tflane_jax.datasets.openlane_sd_map import FILE
 from tflane_jax.errors import UserError
 from tflane_jax.files.fields import load_json
-from tflane_jax.files.openlane import FrameKey
+from tflane_jax.files.openlane import FrameKey, frames_of
 
 # Frames of a segment that are read to find its subset.
 _TRIED = 3

@@ -21,8 +21,8 @@ from jaxtyping import Float
 from tflane_jax.datasets.base import SPLITS, Split
 from tflane_jax.datasets.plausible import FARTHEST, MOST_PIXELS
 from tflane_jax.errors import UserError
-from tflane_jax.files.fields import file_within, is_time, items, load_json, load_members, member, numbers
-from tflane_jax.files.openlane import CENTERLINE, SEGMENT, FrameKey
+from tflane_jax.files.fields import file_within, is_time, load_json, load_members, member, numbers
+from tflane_jax.files.openlane import CENTERLINE, DATA_DICT, SEGMENT, FrameKey, frames_of
 from tflane_jax.files.wording import shown
 from tflane_jax.geometry import pose_matrix
 
@@ -66,7 +66,7 @@ SUBSETS: Mapping[SubsetName, Subset] = {
         sizes=((1550, 2048), *6 * ((2048, 1550),)),
         tick_ns=1,
         first_segment={"train": 0, "val": 10_000, "test": 20_000},
-        data_dict="data_dict_subset_A.json",
+        data_dict=f"{DATA_DICT}A.json",
         tracks_hz=10.0,
     ),
     "B": Subset(
@@ -74,7 +74,7 @@ SUBSETS: Mapping[SubsetName, Subset] = {
         sizes=6 * ((1600, 900),),
         tick_ns=1000,
         first_segment={"train": 1000, "val": 11_000, "test": 21_000},
-        data_dict="data_dict_subset_B.json",
+        data_dict=f"{DATA_DICT}B.json",
         tracks_hz=2.0,
     ),
 }
@@ -197,18 +197,6 @@ def _instead(split: str, others: Sequence[str]) -> str:
         f", only of {' and '.join(others)}: choose --split {others[0]}, or in a run's settings, where data.train, "
         f"data.val and data.test name the official split that serves as each, --data.{split} {others[0]}"
     )
-
-
-def frames_of(content: Any, split: str, where: str) -> list[FrameKey]:
-    """Return the frames of a split that a split file names, in its order; raises UserError where it is malformed."""
-    segments = member(content, split, where)
-    if not isinstance(segments, Mapping):
-        raise UserError(f"{where}: {split} is of type {type(segments).__name__}, expected a mapping from segments")
-    return [
-        FrameKey(split, str(segment), str(name).removesuffix(".json"))
-        for segment in segments
-        for name in items(segments, segment, f"{where}: {split}")
-    ]
 
 
 def _time(key: FrameKey, root: Path) -> int:

@@ -262,10 +262,10 @@ def scores(values: Sequence[Any], where: str) -> np.ndarray:
     return fractions(values, (len(values),), where)
 
 
-def fractions(value: Any, shape: tuple[int | None, ...], where: str) -> np.ndarray:
-    """Return an array of numbers from 0 to 1; truth values count as such."""
+def fractions(value: Any, shape: tuple[int | None, ...], where: str, *, largest: float = 1.0) -> np.ndarray:
+    """Return an array of numbers from 0 to 1, or to another largest one; truth values count as such."""
     array = numbers(_as_integers(value, shape, where), shape, where)
-    if (outside := (array < 0.0) | (array > 1.0)).any():
+    if (outside := (array < 0.0) | (array > largest)).any():
         index = tuple(int(i) for i in np.argwhere(outside)[0])
         number = f"number {index[0]}" if len(index) == 1 else f"entry {list(index)}"
         raise UserError(f"{where}: {number} is {digits(array[index])}, expected 0 to 1{_remedy(array)}")

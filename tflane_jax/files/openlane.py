@@ -6,6 +6,7 @@ docs/reference/data_formats.md, section 2.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,6 +20,8 @@ ATTRIBUTES = 13
 """Attributes of traffic elements, 0 (unknown) to 12."""
 DENSE_POINTS = 201
 """Points of an annotated centerline."""
+DATA_DICT = "data_dict_subset_"
+"""With A.json and B.json: the split files of the two subsets, which may share a folder."""
 _WIDEST = 1e5
 """Largest coordinate of a box, pixels."""
 
@@ -51,6 +54,18 @@ class FrameKey(NamedTuple):
     def scene(self) -> str:
         """The drive to which the frame belongs."""
         return f"{self.split}/{self.segment}"
+
+
+def frames_of(content: Any, split: str, where: str) -> list[FrameKey]:
+    """Return the frames of a split that a split file names, in its order; raises UserError where it is malformed."""
+    segments = member(content, split, where)
+    if not isinstance(segments, Mapping):
+        raise UserError(f"{where}: {split} is of type {type(segments).__name__}, expected a mapping from segments")
+    return [
+        FrameKey(split, str(segment), str(name).removesuffix(".json"))
+        for segment in segments
+        for name in items(segments, segment, f"{where}: {split}")
+    ]
 
 
 def read_lines(record: Any, things: str, field: str, where: str, least: int = 1) -> list[Float[np.ndarray, "_ 3"]]:

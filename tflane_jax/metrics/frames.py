@@ -118,11 +118,14 @@ def checked_edges(edges: Any, shape: tuple[int, ...], what: str) -> Bool[np.ndar
 
 
 def checked_confidence(confidence: Any, shape: tuple[int, ...], what: str) -> Float[np.ndarray, "a b"]:
-    """Return confidences of relations; raise UserError for another shape or numbers outside 0 to 1, such as logits."""
+    """Return confidences of relations; raise UserError for another shape or negative numbers, such as logits.
+
+    They may exceed 1, as sums do: only their order counts, and which exceed 0.5.
+    """
     confidence = np.asarray(confidence)
     check_shape(confidence, shape, what)
-    if ((confidence < -_ROUNDING) | (confidence > 1 + _ROUNDING)).any():
-        raise UserError(f"{what} has confidences outside 0 to 1: apply the sigmoid to logits first")
+    if (confidence < -_ROUNDING).any():
+        raise UserError(f"{what} has negative confidences: apply the sigmoid to logits first")
     return confidence
 
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -42,6 +43,7 @@ from tflane_jax.metrics.segment_matching import (
     SegmentTruth,
 )
 from tflane_jax.progress import progress_bar
+from tflane_jax.scoring.openlane_folder import annotation_files
 
 # Published numbers use every 20th point of a centerline.
 _STRIDE = 20
@@ -57,17 +59,17 @@ def read_predictions(path: Path) -> dict[FrameKey, LaneDetections]:
     return _submission(path, lambda record, where: _detections(record, where, CENTERLINE))
 
 
-def read_truth(
-    path: Path, *, splits: Collection[str] | None = None, progress: bool = True
-) -> dict[FrameKey, LaneTruth]:
+def read_truth(path: Path, *, predicted: Collection[FrameKey] = (), progress: bool = True) -> dict[FrameKey, LaneTruth]:
     """Return centerline annotations, a collected file's or a folder's; raises UserError as `read_predictions`.
 
     Args:
         path: the file or folder.
-        splits: those of a folder that are read; None for all.
+        predicted: frames whose truth is wanted: of a folder, their splits and subsets are read; with none, all.
         progress: show a bar.
     """
-    return _annotations(path, CENTERLINE, lambda record, where: _truth(record, where, CENTERLINE), splits, progress)
+    return _annotations(
+        path, CENTERLINE, lambda record, where, _: _truth(record, where, CENTERLINE), predicted, progress
+    )
 
 
 def read_segment_predictions(path: Path) -> dict[FrameKey, SegmentDetections]:
@@ -76,14 +78,16 @@ def read_segment_predictions(path: Path) -> dict[FrameKey, SegmentDetections]:
 
 
 def read_segment_truth(
-    path: Path, flavour: Flavour = "OpenLane-V2", *, splits: Collection[str] | None = None, progress: bool = True
+    path: Path, flavour: Flavour = "OpenLane-V2", *, predicted: Collection[FrameKey] = (), progress: bool = True
 ) -> dict[FrameKey, SegmentTruth]:
-    """Return lane-segment annotations; path, splits, progress and errors are those of `read_truth`.
+    """Return lane-segment annotations; path, predicted, progress and errors are those of `read_truth`.
 
-    Lines are resampled to 10 points and areas to 20. In the flavour "LaneSegNet" a crossing of five corners becomes its
-    two long sides of 10 points each.
+    Lines are resampled to 10 points and areas to 20; of a collected file, which the devkit has resampled, those that
+    have other counts. In the flavour "LaneSegNet" a crossing of five corners becomes its two long sides of 10 points
+    each.
     """
-    return _annotations(path, SEGMENT, lambda record, where: _segment_truth(record, where, flavour), splits, progress)
+    parse = partial(_segment_truth, flavour=flavour)
+    return _annotations(path, SEGMENT, parse, predicted, progress)
 
 
 T = TypeVar("T")
@@ -98,41 +102,21 @@ def _submission(path: Path, parse: _Parse[T]) -> dict[FrameKey, T]:
 
 
 def _annotations(
-    path: Path, names: FieldNames, parse: _Parse[T], splits: Collection[str] | None, progress: bool
+    path: Path, names: FieldNames, parse: Callable[[Any, str, bool], T], predicted: Collection[FrameKey], progress: bool
 ) -> dict[FrameKey, T]:
-    if not os.path.isdir(path):
-        collected = load_file(path)
-        if not isinstance(collected, Mapping):
-            raise UserError(f"{path} is of type {type(collected).__name__}, expected a mapping from frames")
-        return _by_frame(collected, "annotation", path, parse)
-    stems = {file: file.stem.removesuffix("-ls") for file in _annotation_files(path.resolve(), splits)}
-    files = {file: stem for file, stem in stems.items() if file.stem == stem + names.suffix}
-    if not files:
-        other = f"; it has {len(stems)} files of the other task" if stems else ""
-        of = f" of split {', '.join(sorted(splits))}" if splits else ""
-        raise UserError(
-            f"{path} holds no annotations{of}: expected <split>/<segment>/info/<timestamp>{names.suffix}.json in it"
-            f"{other}"
+    """Return annotations; `parse` takes a record, the words that name it, and whether it is the dataset's own."""
+    if os.path.isdir(path):
+        files = progress_bar(
+            annotation_files(path.resolve(), names, predicted, path).items(),
+            desc=f"read {path.name}",
+            unit="frame",
+            disable=not progress,
         )
-    frames, origin = {}, {}
-    for file, stem in progress_bar(files.items(), desc=f"read {path.name}", unit="frame", disable=not progress):
-        segment = file.parent.parent
-        key = FrameKey(segment.parent.name, segment.name, stem)
-        if key in origin:
-            raise UserError(f"{path}: frame {named(key)} is there twice: {origin[key]} and {file}")
-        origin[key] = file
-        frames[key] = parse(member(load_file(file), "annotation", str(file)), str(file))
-    return frames
-
-
-def _annotation_files(folder: Path, splits: Collection[str] | None) -> list[Path]:
-    """Return the annotations of some splits (None: all) in the dataset's folder, or in that of one split."""
-    if splits is None:
-        return sorted(folder.glob("**/info/*.json"))
-    # Not `folder / split`: that name comes from the predictions, and "/" is one.
-    below = [found for found in folder.iterdir() if found.name in splits and found.is_dir()] or [folder]
-    files = (file for each in below for file in each.glob("**/info/*.json"))
-    return sorted(file for file in files if file.parent.parent.parent.name in splits)
+        return {key: parse(member(load_file(file), "annotation", str(file)), str(file), True) for key, file in files}
+    collected = load_file(path)
+    if not isinstance(collected, Mapping):
+        raise UserError(f"{path} is of type {type(collected).__name__}, expected a mapping from frames")
+    return _by_frame(collected, "annotation", path, lambda record, where: parse(record, where, False))
 
 
 def _by_frame(records: Mapping[Any, Any], field: str, path: Path, parse: _Parse[T]) -> dict[FrameKey, T]:
@@ -169,7 +153,7 @@ def _detections(record: Any, where: str, names: FieldNames) -> LaneDetections:
     boxes, attributes = _elements(record, where)
     _check_ids(record, (names.lanes, "traffic_element"), where)
     lane_lane, lane_element = (
-        fractions(member(record, field, where), (len(points), count), f"{where}: {field}")
+        fractions(member(record, field, where), (len(points), count), f"{where}: {field}", largest=np.inf)
         for field, count in ((names.lane_lane, len(points)), (names.lane_element, len(boxes)))
     )
     return LaneDetections(
@@ -180,19 +164,23 @@ def _detections(record: Any, where: str, names: FieldNames) -> LaneDetections:
     )
 
 
-def _segment_truth(record: Any, where: str, flavour: Flavour) -> SegmentTruth:
+def _segment_truth(record: Any, where: str, raw: bool, flavour: Flavour) -> SegmentTruth:
+    def with_points(line: np.ndarray, count: int) -> np.ndarray:
+        return line if len(line) == count and not raw else resample(line, count)
+
     lanes = _truth(record, where, SEGMENT)
-    points, categories = read_areas(record, where, _LEAST)
+    outlines, categories = read_areas(record, where, _LEAST)
     _check_ids(record, ("area",), where)
-    if flavour == "LaneSegNet":
-        points = [
-            _long_sides(line) if c == CROSSING and len(line) == 5 else line
-            for line, c in zip(points, categories, strict=True)
-        ]
+    areas = [
+        _long_sides(line)
+        if flavour == "LaneSegNet" and c == CROSSING and len(line) == 5
+        else with_points(line, AREA_POINTS)
+        for line, c in zip(outlines, categories, strict=True)
+    ]
     sides = (read_lines(record, SEGMENT.lanes, f"{side}_laneline", where, _LEAST) for side in _SIDES)
-    center, left, right = ([_with_points(line, LINE_POINTS) for line in lines] for lines in (lanes.points, *sides))
-    areas = AreaTruth([_with_points(line, AREA_POINTS) for line in points], categories)
-    return SegmentTruth(replace(lanes, points=center), left, right, areas, *_types(record, where))
+    center, left, right = ([with_points(line, LINE_POINTS) for line in lines] for lines in (lanes.points, *sides))
+    types = _types(record, where)
+    return SegmentTruth(replace(lanes, points=center), left, right, AreaTruth(areas, categories), *types)
 
 
 def _segment_detections(record: Any, where: str) -> SegmentDetections:
@@ -258,10 +246,6 @@ def _check_ids(record: Any, groups: tuple[str, ...], where: str) -> None:
 
 
 _SIDES = ("left", "right")
-
-
-def _with_points(line: np.ndarray, count: int) -> np.ndarray:
-    return line if len(line) == count else resample(line, count)
 
 
 def _long_sides(corners: np.ndarray) -> np.ndarray:

@@ -32,7 +32,7 @@ class ScoringProtocol:
 
     Attributes:
         read_predictions, read_truth: read a path and return the input of the metric by frame. With frames that have a
-            split, `read_truth` takes the `splits` of a folder to read.
+            split, `read_truth` takes those that are `predicted`.
         scene_of: returns the name of a frame's scene.
         metrics: returns a new accumulator.
         columns: of the table, in this order; the JSON file has them all.
@@ -62,13 +62,13 @@ class ScoringProtocol:
     def read(self, predictions: Path, truth: Path) -> tuple[Mapping[Any, Any], Mapping[Any, Any]]:
         """Return the content of both files by frame; raises UserError that names file, frame, field and cause.
 
-        Of OpenLane-V2's folder, the splits that are predicted are read: that of the test has no annotations.
+        Of OpenLane-V2's folder, the predicted splits and subset are read: the test split has no annotations.
         """
         for path in (predictions, truth):
             check_there(path)
         found = self._read(self.read_predictions, predictions, "predictions")
-        splits = {key.split for key in found if isinstance(key, FrameKey)}
-        read = partial(self.read_truth, splits=splits) if splits and truth.is_dir() else self.read_truth
+        predicted = [key for key in found if isinstance(key, FrameKey)]
+        read = partial(self.read_truth, predicted=predicted) if predicted and truth.is_dir() else self.read_truth
         return found, self._read(read, truth, "ground truth")
 
     def _read(self, read: Callable[[Path], Mapping[Any, Any]], path: Path, side: Side) -> Mapping[Any, Any]:

@@ -35,6 +35,7 @@ def centerlines(predictions: Mapping[Any, LaneDetections], truth: Mapping[Any, L
         *_other_counts("predicted centerlines", _lines(predictions, lambda one: one.points), CENTERLINE_POINTS),
         *_other_counts("true centerlines", _lines(truth, lambda one: one.points), CENTERLINE_POINTS),
         *units(predictions, truth),
+        *_sums(predictions),
         *_boxes("predicted", [one.elements for one in predictions.values()]),
         *_boxes("true", [one.elements for one in truth.values()]),
     ]
@@ -67,7 +68,8 @@ def segments(predictions: Mapping[Any, SegmentDetections], truth: Mapping[Any, S
     ]
     sides = [*swapped_sides("predicted", predictions), *swapped_sides("true", truth)]
     counted = [remark for remarks in counts for remark in remarks]
-    return [*unusual(predictions, truth), *sides, *counted, *areas, *units, *boxes]
+    sums = _sums({key: one.lanes for key, one in predictions.items()})
+    return [*unusual(predictions, truth), *sides, *counted, *areas, *units, *sums, *boxes]
 
 
 def images(predictions: Mapping[Any, RowLanes], truth: Mapping[Any, RowLanes], time_limit: float) -> list[str]:
@@ -171,6 +173,22 @@ def _units(predictions: Mapping[Any, Lines], truth: Mapping[Any, Lines]) -> list
     return [
         f"predicted lines reach {found:.3g} from the origin, true ones {true:.3g} (median over frames): are the "
         "predictions normalised, in other units or in another frame?"
+    ]
+
+
+def _sums(predictions: Mapping[Any, LaneDetections]) -> list[str]:
+    """Return a remark on topology above 1, which no probability is."""
+    above = [
+        key
+        for key, one in predictions.items()
+        for scores in (one.successor, None if one.elements is None else one.elements.lane)
+        if scores is not None and np.max(scores, initial=0.0) > 1.0
+    ]
+    if not above:
+        return []
+    return [
+        f"predicted topology exceeds 1 in {len(set(above))} of {len(predictions)} frames (frame {named(above[0])}), as "
+        "sums do: its order counts, and what exceeds 0.5"
     ]
 
 

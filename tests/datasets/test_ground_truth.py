@@ -234,5 +234,8 @@ def test_traffic_elements_are_tied_to_the_chains_of_their_segments():
     assert (out.position[0, 0], dropped) == (30.0, 1)
     # The same elements tied to the segments themselves: 11 is a row of its own.
     segments = crop(vector_map, flavour="segments", capacity=4)
-    out, _ = traffic_elements(elements, shown, prepared.segment_of, segments, np.eye(4), RANGE, capacity=3)
-    assert out.lane.tolist() == [[False] * 3, [True, False, False], [False, True, False], [False] * 3]
+    out, _ = traffic_elements(
+        elements, shown, prepared.segment_of, segments, np.eye(4), RANGE, capacity=3, of="segments"
+    )
+    assert out.lane is None
+    assert out.segment.tolist() == [[False] * 3, [True, False, False], [False, True, False], [False] * 3]

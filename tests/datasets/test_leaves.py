@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from tests.fakes import fake_example, fake_views
+from tests.models.cases import make_bucket_example
 from tflane_jax.datasets.leaves import PARTS, example_from_leaves, example_leaves
 from tflane_jax.scene import Example, MapLines, MarkerObservations, SdMap, VehicleState
 
@@ -47,6 +48,7 @@ def with_vehicle(can_bus):
         full_example(),
         with_vehicle(np.arange(18.0)),
         with_vehicle(None),
+        make_bucket_example(),
         fake_example(),
         fake_example().replace(bev=None),
     ],

@@ -111,6 +111,7 @@ def element(**entries):
         ("", element(points=[[14, 12], [10, 4]]), "box has no area"),
         ("-ls", annotate(topology_lsls=[]), "topology_lsls"),
         ("-ls", lambda content: content["annotation"]["area"][0].update(category=3), "whole number from 1 to 2"),
+        ("-ls", lambda content: content["annotation"]["area"][0].update(category=1), "does not end where it begins"),
         ("-ls", lambda content: content["annotation"]["lane_segment"][0].pop("left_laneline"), "lacks the entry"),
     ],
 )

@@ -1,7 +1,9 @@
 """A dataset written as OpenLane-V2 and read again."""
 
 import json
+from dataclasses import replace
 
+import jax
 import numpy as np
 import pytest
 
@@ -103,6 +105,35 @@ def test_ids_stay_with_their_lanes(exported):
     elements = [[element["id"] for element in frame["traffic_element"]] for frame in frames]
     assert elements[0] == elements[1] == elements[2]
     assert len(set(elements[0]) | set(lanes[0])) == 5
+
+
+class Governing(DriveDataset):
+    """The same, with elements that tell their segments, crossings by their sides, and as many segments as lanes."""
+
+    def example(self, index):
+        example = super().example(index)
+        elements, points = example.traffic_elements, example.areas.points.copy()
+        points[1, ::] = np.concatenate([np.linspace([9, -3, 0], [9, 3, 0], 10), np.linspace([6, 3, 0], [6, -3, 0], 10)])
+        areas = replace(example.areas, points=points, category=np.array([2, 1], np.int32), valid=np.ones(2, bool))
+        lanes = jax.tree.map(lambda leaf: leaf[:4], example.lanes)
+        lanes = replace(lanes, points=lanes.points[[2, 1, 0, 3]], successor=lanes.successor[:, :4])
+        governing = replace(elements, lane=None, segment=elements.lane[:4])
+        return replace(example, lanes=lanes, areas=areas, traffic_elements=governing)
+
+
+def test_segments_govern_lanes_and_sides_become_a_ring(tmp_path):
+    """Whatever form an example has, the files have the official one."""
+    root = export_openlane_v2({"val": Governing(DriveConfig(scenes=1))}, tmp_path / "made", progress=False)
+    path = sorted((root / "val" / "11000" / "info").glob("*-ls.json"))[0]
+    segments = json.loads(path.read_text())["annotation"]
+    assert segments["topology_lste"] == [[1, 0], [0, 0], [0, 1]]
+    ring = [area["points"] for area in segments["area"] if area["category"] == 1]
+    assert ring == [[[9, -3, 0], [9, 3, 0], [6, 3, 0], [6, -3, 0], [9, -3, 0]]]
+    lanes = json.loads(path.with_name(path.name.replace("-ls", "")).read_text())["annotation"]
+    assert lanes["topology_lcte"] == [[0, 1], [0, 0], [1, 0]]  # the first and the third lane have changed places
+    sides = OpenLaneV2Config(root, subset="B", split="val", flavour="lane_segment", image=None)
+    areas = OpenLaneV2Dataset(replace(sides, example=replace(SIZES, crossings="sides"))).example(0).areas
+    np.testing.assert_allclose(areas.points[1], Governing().example(0).areas.points[1], atol=1e-4)
 
 
 def test_the_scorer_reads_it_too(exported):

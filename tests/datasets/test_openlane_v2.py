@@ -128,8 +128,9 @@ def test_flavours_fill_their_own_part(whole, flavour, lanes, segments):
     assert example.cameras is None
     assert (example.lanes.valid.sum(), example.segments.valid.sum()) == (lanes, segments)
     assert example.areas.valid.sum() == (flavour == "lane_segment")
-    assert len(example.traffic_elements.lane) == (5 if flavour == "centerline" else 4)
-    assert example.traffic_elements.lane[:3, :2].tolist() == [[True, False], [False, False], [False, True]]
+    governs = example.traffic_elements.lane if flavour == "centerline" else example.traffic_elements.segment
+    assert len(governs) == (5 if flavour == "centerline" else 4)
+    assert governs[:3, :2].tolist() == [[True, False], [False, False], [False, True]]
     np.testing.assert_allclose(example.traffic_elements.box[0], [[10, 4], [14, 12.5]])
 
 

@@ -8,6 +8,7 @@ import pytest
 from tflane_jax.evaluation.lane_segments import detections_of_segments, segment_detections, truth_of_segments
 from tflane_jax.metrics import ElementDetections, LaneSegmentMetrics
 from tflane_jax.scene import AreaPrediction, Areas, AreaType, LaneGraph, SegmentPrediction, TrafficElements
+from tflane_jax.scene.lane_segments import governed_lanes, governed_segments
 
 VALID = np.array([True, False, True, True])
 
@@ -73,16 +74,26 @@ def test_truth_holds_what_is_valid():
     assert truth_of_segments(segments, areas).lanes.elements is None
 
 
-def test_rows_of_the_elements_may_be_the_segments():
+def test_elements_may_govern_the_segments_themselves():
     segments, lanes, areas, elements = scene()
-    direct = dataclasses.replace(elements, lane=np.eye(4, 3, dtype=bool)[[1, 0, 2, 2]])
-    truth = truth_of_segments(segments, areas, direct)
-    assert truth.lanes.elements is not None
-    np.testing.assert_array_equal(truth.lanes.elements.lane, [[True, False], [False, True], [False, True]])
-    with pytest.raises(ValueError, match=r"3 rows, expected one for each of 4 segments"):
+    direct = dataclasses.replace(elements, lane=None, segment=np.eye(4, 3, dtype=bool)[[1, 0, 2, 2]])
+    for centerlines in (None, lanes):
+        truth = truth_of_segments(segments, areas, direct, centerlines)
+        assert truth.lanes.elements is not None
+        np.testing.assert_array_equal(truth.lanes.elements.lane, [[True, False], [False, True], [False, True]])
+    with pytest.raises(ValueError, match="govern centerlines: pass `lanes`"):
         truth_of_segments(segments, areas, elements)
-    with pytest.raises(ValueError, match=r"4 rows, expected one for each of 3 centerlines"):
-        truth_of_segments(segments, areas, direct, lanes)
+
+
+def test_what_governs_a_lane_follows_from_its_segments_and_back():
+    """Each way, of what lies on what; a lane is governed by what governs any of its segments."""
+    segments, lanes, _, elements = scene()
+    by_segment = governed_segments(elements, segments, lanes)
+    np.testing.assert_array_equal(by_segment[VALID][:, 1:], [[True, False], [True, False], [False, True]])
+    known = dataclasses.replace(elements, lane=None, segment=by_segment)
+    np.testing.assert_array_equal(governed_lanes(known, lanes, segments)[1:, 1:], [[True, False], [False, True]])
+    assert governed_lanes(None, lanes, segments).shape == (3, 0)
+    assert governed_segments(None, segments, lanes).shape == (4, 0)
 
 
 def perfect(garbage=0.0, successor=None):
@@ -153,7 +164,7 @@ def test_padding_and_invalid_queries_change_nothing():
 
 
 def test_empty_input():
-    empty = truth_of_segments(LaneGraph.empty(3, 5), Areas.empty(2, 9), TrafficElements.empty(2, 3))
+    empty = truth_of_segments(LaneGraph.empty(3, 5), Areas.empty(2, 9), TrafficElements.empty(2, segments=3))
     line = np.zeros((0, 5, 3))
     none = segment_detections(line, line, line, np.zeros(0, int), np.zeros(0), np.zeros((0, 0)))
     metrics = LaneSegmentMetrics("LaneSegNet")

@@ -297,7 +297,7 @@ def test_elements_count_as_matched_pairs_and_not_at_all_in_a_frame_without_any()
     assert len(pairs) == 4 * 2  # of the queries of four segments and of two elements
     assert (len(set(pairs[:, 0])), len(set(pairs[:, 1]))) == (4, 2)
     assert float(report["element_class"]) > 0.0
-    edges = int((example.traffic_elements.lane & example.segments.valid[:, None]).sum())
+    edges = int((example.traffic_elements.segment & example.segments.valid[:, None]).sum())
     assert 0 < edges < 8
     # By hand, over the pairs without an edge; which pairs have one follows from the gradient's sign.
     x, rising = np.asarray(outputs.elements.lane_logits)[0, 0][tuple(pairs.T)], gradient[0, 0][tuple(pairs.T)] > 0

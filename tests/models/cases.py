@@ -113,7 +113,9 @@ def make_segment_example(seed: int = 0, instances: int = 9, lanes: int = 4, cros
 def make_bucket_example(seed: int = 0, elements: int = 2) -> Example:
     """Return `make_camera_example` with segments, areas, and elements that govern segments."""
     example, segments = make_camera_example(seed, elements=elements), make_segment_example(seed)
-    return example.replace(segments=segments.segments, areas=segments.areas)
+    truth = example.traffic_elements
+    governing = truth.replace(lane=None, segment=truth.lane)
+    return example.replace(segments=segments.segments, areas=segments.areas, traffic_elements=governing)
 
 
 LINES = MapTrConfig(

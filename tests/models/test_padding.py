@@ -120,8 +120,9 @@ def dirty(example, bad):
         parts["map_lines"] = soiled(example.map_lines, bad, "points", "category", "closed")
     if example.traffic_elements is not None:
         elements = soiled(example.traffic_elements, bad, "box", "attribute")
-        governs = example.lanes.valid[:, None] & elements.valid[None]
-        parts["traffic_elements"] = soiled(elements, bad, "lane", valid=governs)
+        name, graph = ("segment", example.segments) if elements.lane is None else ("lane", example.lanes)
+        governs = graph.valid[:, None] & elements.valid[None]
+        parts["traffic_elements"] = soiled(elements, bad, name, valid=governs)
     return example.replace(**parts)
 
 

@@ -49,6 +49,7 @@ def test_examples_that_fit_are_valid(example):
         ("lanes.left", (8, 10, 3)),
         ("areas.valid", (2,)),
         ("traffic_elements.lane", (5, 3)),
+        ("traffic_elements.segment", (5, 3)),
         ("cameras.camera_from_ego", (3, 3)),
         ("cameras.vehicle.can_bus", (17,)),
         ("map_lines.visibility", (2,)),

@@ -19,6 +19,9 @@ from tflane_jax.geometry import PerceptionRange
 from tflane_jax.geometry.polylines import clip_to_range, nearest_lines, resample, resample_lines
 from tflane_jax.scene import Areas, AreaType
 
+# Metres between both ends of a ring; files have a tenth of this.
+_CLOSED = 1e-3
+
 
 def crop_areas(
     prepared: PreparedMap,
@@ -56,6 +59,11 @@ def crop_areas(
         if crossings == "sides":
             with_sides(areas, [found[i] for i in kept])
     return areas, len(found) - n
+
+
+def is_closed(outline: Float[np.ndarray, "n 3"]) -> bool:
+    """Return whether a line ends where it begins, within a millimetre."""
+    return bool(np.abs(outline[0] - outline[-1]).max() < _CLOSED)
 
 
 def with_sides(areas: Areas, outlines: Sequence[np.ndarray]) -> None:

@@ -50,8 +50,8 @@ class ExampleConfig:
             frame: 2 s at the 10 Hz of the built-in world and of Argoverse 2.
         tracks: instances K of traffic flow.
         elements: traffic lights and signs.
-        elements_of: lanes that they govern, the rows of `TrafficElements.lane`: merged centerlines, as TopoNet learns,
-            or lane segments, as LaneSegNet's map-element-bucket variant.
+        elements_of: what they govern: merged centerlines (`TrafficElements.lane`), as TopoNet learns, or lane segments
+            (`TrafficElements.segment`), as LaneSegNet's map-element-bucket variant.
         bike_lanes: whether bicycle lanes are ground truth.
         sd_map: coarse map of the roads of the built-in world; None leaves it out.
         map_lines: lines of a vector map, the truth of MapTR and MapTRv2; None leaves them out.

@@ -126,6 +126,7 @@ def make_example(log: Log, keyframe: int, config: ExampleConfig) -> Example:
         ego_from_global,
         config.range,
         capacity=config.elements,
+        of=config.elements_of,
         seen=None if rig is None else visible_elements(log, keyframe, rig),
     )
     stride = 1 if log.rate_hz is None else config.history_stride(log.rate_hz)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -160,6 +161,7 @@ def traffic_elements(
     range_: PerceptionRange,
     *,
     capacity: int,
+    of: Literal["centerlines", "segments"] = "centerlines",
     seen: ElementViews | None = None,
 ) -> tuple[TrafficElements, int]:
     """Return lights and signs with the lanes that they govern, and how many exceeded the capacity.
@@ -174,9 +176,13 @@ def traffic_elements(
         ego_from_global: pose.
         range_: perception range, ego frame.
         capacity: elements in the result.
+        of: what `lanes` are.
         seen: the elements in the front image; None if there is no image.
     """
-    out = TrafficElements.empty(capacity, len(lanes.graph.valid))
+    rows, segments = len(lanes.graph.valid), of == "segments"
+    out = TrafficElements.empty(capacity, None if segments else rows, rows if segments else None)
+    governs = out.segment if segments else out.lane
+    assert governs is not None
     if not elements:
         return out, 0
     position = transform_points(ego_from_global, np.stack([e.position for e in elements]))
@@ -186,7 +192,7 @@ def traffic_elements(
     kept = np.sort(found[np.argsort(distance[found], kind="stable")[:capacity]])
     for row, element in enumerate(kept):
         governed = [number[s] for s in elements[element].lanes if s in number]
-        out.lane[: len(lanes.lane), row] = np.isin(lanes.lane, governed)
+        governs[: len(lanes.lane), row] = np.isin(lanes.lane, governed)
     n = len(kept)
     out.position[:n] = position[kept]
     if seen is not None:

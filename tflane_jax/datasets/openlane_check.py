@@ -14,6 +14,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from tflane_jax.datasets.areas import is_closed
 from tflane_jax.datasets.base import SPLITS, ExampleConfig, Split
 from tflane_jax.datasets.openlane_annotation import Annotation, read_annotation
 from tflane_jax.datasets.openlane_check_cameras import CameraChecks, Images
@@ -33,6 +34,7 @@ from tflane_jax.datasets.plausible import check_motion
 from tflane_jax.errors import UserError
 from tflane_jax.files.openlane import CENTERLINE, SEGMENT, FrameKey
 from tflane_jax.progress import progress_bar
+from tflane_jax.scene import AreaType
 
 _WITH_LOG, _WITHOUT_LOG, _WITH_TRAFFIC = "with log", "without log", "with traffic"
 # Name of the log of a segment whose files do not tell it; no log has it.
@@ -242,6 +244,9 @@ def _check_annotation(found: Annotation) -> Iterator[str]:
         yield f"a lane reaches {far:.0f} m from the vehicle, expected some 50: metres, in the ego frame?"
     if (np.diff(found.boxes, axis=1) <= 0.0).any():
         yield "a traffic element's box has no area: its points should be the top-left and the bottom-right corner"
+    crossings = [found.areas[i] for i in np.flatnonzero(found.area_category == AreaType.PEDESTRIAN_CROSSING)]
+    if not all(is_closed(outline) for outline in crossings):
+        yield "the outline of a crossing does not end where it begins: its points should be those of a ring"
     lights = np.isin(found.attribute, (1, 2, 3))
     if (lights & (found.element_category != 1)).any() or ((found.attribute > 3) & (found.element_category != 2)).any():
         yield "a traffic element's attribute does not fit its category (1 to 3 are of lights, 4 to 12 of signs)"

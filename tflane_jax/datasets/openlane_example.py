@@ -38,13 +38,13 @@ def blank(
 
     Args:
         config: capacities and points.
-        governed: which lanes the rows of `TrafficElements.lane` are.
+        governed: what traffic elements govern.
         views: of the cameras, or None.
         traffic: whether there is a traffic flow.
     """
     lanes = LaneGraph.empty(config.lanes, config.lane_points)
     segments = LaneGraph.empty(config.segments, config.segment_points)
-    rows = segments if governed == "segments" else lanes
+    rows = {governed: config.segments if governed == "segments" else config.lanes}
     return Example(
         bev=None,
         hidden=None,
@@ -56,7 +56,7 @@ def blank(
         lanes=lanes,
         segments=segments,
         areas=Areas.empty(config.areas, config.area_points),
-        traffic_elements=TrafficElements.empty(config.elements, len(rows.valid)),
+        traffic_elements=TrafficElements.empty(config.elements, **rows),
         previous_from_ego=np.eye(4, dtype=np.float32),
         has_previous=np.asarray(False),
         cameras=views,
@@ -107,11 +107,10 @@ def lane_graph(found: Annotation, capacity: int, points: int) -> tuple[LaneGraph
     kept = _nearest(found.lines, capacity, "lanes" if found.left is None else "segments")
     graph, n = LaneGraph.empty(capacity, points), len(kept)
     if n:
-        graph.points[:n] = _with_points([found.lines[i] for i in kept], points)
-        graph.left[:n] = graph.points[:n] if found.left is None else _with_points([found.left[i] for i in kept], points)
-        graph.right[:n] = (
-            graph.points[:n] if found.right is None else _with_points([found.right[i] for i in kept], points)
-        )
+        graph.points[:n] = graph.left[:n] = graph.right[:n] = _with_points([found.lines[i] for i in kept], points)
+        if found.left is not None and found.right is not None:  # lane segments, which the devkit always resamples
+            for lines, out in ((found.lines, graph.points), (found.left, graph.left), (found.right, graph.right)):
+                out[:n] = resample_lines([lines[i] for i in kept], points)
         graph.left_type[:n], graph.right_type[:n] = found.left_type[kept], found.right_type[kept]
         graph.is_connector[:n] = found.is_connector[kept]
         graph.visibility[:n] = 1.0
@@ -125,7 +124,7 @@ def area_set(found: Annotation, capacity: int, points: int, crossings: Literal["
     kept = _nearest(found.areas, capacity, "areas")
     areas, n = Areas.empty(capacity, points), len(kept)
     if n:
-        areas.points[:n] = _with_points([found.areas[i] for i in kept], points)
+        areas.points[:n] = resample_lines([found.areas[i] for i in kept], points)
         areas.category[:n] = found.area_category[kept]
         areas.valid[:n] = True
         if crossings == "sides":
@@ -141,7 +140,7 @@ def element_set(
     Args:
         found: annotation, with boxes in pixels of the file.
         out: empty elements, filled in place.
-        lanes: indices of the annotated lanes that are the first rows of `out.lane`.
+        lanes: indices of the annotated lanes that are the first rows of `out.lane`, or of `out.segment`.
         fit: scaling and cropping of the front image; None leaves the boxes as they are.
     """
     boxes = found.boxes if fit is None else fit.boxes(found.boxes)
@@ -153,7 +152,9 @@ def element_set(
     n = len(kept)
     out.box[:n] = boxes[kept]
     out.category[:n], out.attribute[:n] = found.element_category[kept], found.attribute[kept]
-    out.lane[: len(lanes), :n] = found.lane_element[np.ix_(lanes, kept)]
+    governs = out.segment if out.lane is None else out.lane
+    assert governs is not None  # see `blank`
+    governs[: len(lanes), :n] = found.lane_element[np.ix_(lanes, kept)]
     out.valid[:n] = True
     return out
 
@@ -171,7 +172,7 @@ def _warn_dropped(count: int, name: str) -> None:
 
 
 def _with_points(lines: list[np.ndarray], count: int) -> Any:
-    """Return lines with `count` points: as they are, every k-th of a dense line, or resampled."""
+    """Return centerlines with `count` points: as they are, every k-th of a dense line, or resampled."""
     stride = (DENSE_POINTS - 1) // (count - 1) if count > 1 and (DENSE_POINTS - 1) % (count - 1) == 0 else 0
     if stride and all(len(line) == DENSE_POINTS for line in lines):
         return np.stack([line[::stride] for line in lines])

@@ -1,7 +1,7 @@
 """Write any dataset with cameras in OpenLane-V2's layout, for the official repositories and for `openlane_v2`.
 
-Examples have no ids; `datasets.identities` gives lanes, areas and elements ids that last from frame to frame. Which
-lane segments an element governs is not in an example either; it is derived from the centerlines that they lie on.
+Examples have no ids; `datasets.identities` gives lanes, areas and elements ids that last from frame to frame. An
+example tells which centerlines, or which lane segments, an element governs; the others follow from what lies on what.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Bool, Float
 
+from tflane_jax.datasets.areas import is_closed
 from tflane_jax.datasets.base import Dataset, FrameInfo, Split
 from tflane_jax.datasets.identities import Identities
 from tflane_jax.datasets.openlane_frames import SUBSETS, SubsetName, info_path
@@ -25,8 +26,8 @@ from tflane_jax.files.openlane import CENTERLINE, DENSE_POINTS, SEGMENT, FrameKe
 from tflane_jax.geometry import invert_pose
 from tflane_jax.geometry.polylines import resample
 from tflane_jax.progress import progress_bar
-from tflane_jax.scene import CameraViews, Example, TrafficElements
-from tflane_jax.scene.lane_segments import segments_on_lanes
+from tflane_jax.scene import Areas, AreaType, CameraViews, Example, TrafficElements
+from tflane_jax.scene.lane_segments import governed_lanes, governed_segments
 
 ImageFormat = Literal["jpg", "png"]
 VERSION = "tflane_jax 1"
@@ -163,8 +164,8 @@ def _sensors(
 
 def centerline_annotation(example: Example, ids: Identities) -> dict[str, Any]:
     """Return the annotation of a frame in the centerline flavour, 201 points a line."""
-    rows = np.flatnonzero(example.lanes.valid)
-    elements = _elements(example.traffic_elements, ids)
+    elements, rows = example.traffic_elements, np.flatnonzero(example.lanes.valid)
+    governed = governed_lanes(elements, example.lanes, example.segments)
     return {
         CENTERLINE.lanes: [
             {
@@ -174,17 +175,16 @@ def centerline_annotation(example: Example, ids: Identities) -> dict[str, Any]:
             }
             for n in rows.tolist()
         ],
-        "traffic_element": elements,
+        "traffic_element": _elements(elements, ids),
         CENTERLINE.lane_lane: example.lanes.successor[np.ix_(rows, rows)].astype(int).tolist(),
-        CENTERLINE.lane_element: _governed(example)[rows].astype(int).tolist(),
+        CENTERLINE.lane_element: _lane_element(elements, governed[rows]),
     }
 
 
 def segment_annotation(example: Example, ids: Identities) -> dict[str, Any]:
     """Return the annotation of a frame in the lane-segment flavour, with as many points as the example has."""
-    graph, areas = example.segments, example.areas
-    rows = np.flatnonzero(graph.valid)
-    lane_element = segments_on_lanes(graph, example.lanes)[rows] @ _governed(example)
+    graph, areas, elements = example.segments, example.areas, example.traffic_elements
+    governed, rows = governed_segments(elements, graph, example.lanes), np.flatnonzero(graph.valid)
     return {
         SEGMENT.lanes: [
             {
@@ -198,13 +198,13 @@ def segment_annotation(example: Example, ids: Identities) -> dict[str, Any]:
             }
             for n in rows.tolist()
         ],
-        "traffic_element": _elements(example.traffic_elements, ids),
+        "traffic_element": _elements(elements, ids),
         "area": [
-            {"id": ids.areas[n], "category": int(areas.category[n]), "points": _rounded(areas.points[n])}
+            {"id": ids.areas[n], "category": int(areas.category[n]), "points": _rounded(_outline(areas, n))}
             for n in np.flatnonzero(areas.valid).tolist()
         ],
         SEGMENT.lane_lane: graph.successor[np.ix_(rows, rows)].astype(int).tolist(),
-        SEGMENT.lane_element: lane_element.astype(int).tolist(),
+        SEGMENT.lane_element: _lane_element(elements, governed[rows]),
     }
 
 
@@ -221,15 +221,18 @@ def dense(line: Float[np.ndarray, "p 3"], count: int = DENSE_POINTS) -> Float[np
     return np.stack([np.interp(places, np.arange(pieces + 1), line[:, i]) for i in range(3)], -1)
 
 
-def _governed(example: Example) -> Bool[np.ndarray, "n e"]:
-    """Return which lanes each valid element governs."""
-    elements = example.traffic_elements
-    if elements is None:
-        return np.zeros((len(example.lanes.valid), 0), bool)
-    lane = np.zeros((len(example.lanes.valid), len(elements.valid)), bool)
-    if len(elements.lane) == len(lane):  # else the rows are lane segments, whose centerlines are unknown
-        lane = np.asarray(elements.lane) & np.asarray(example.lanes.valid)[:, None]
-    return lane[:, np.flatnonzero(elements.valid)]
+def _outline(areas: Areas, row: int) -> Float[np.ndarray, "p 3"]:
+    """Return the outline of an area: of a crossing that is given by its two long sides, the ring of their ends."""
+    points = np.asarray(areas.points[row])
+    if areas.category[row] != AreaType.PEDESTRIAN_CROSSING or is_closed(points):
+        return points
+    half = len(points) // 2
+    return points[[0, half - 1, half, -1, 0]]
+
+
+def _lane_element(elements: TrafficElements | None, governed: Bool[np.ndarray, "k e"]) -> list[list[int]]:
+    """Return which valid elements govern each lane, as 0 and 1."""
+    return governed[:, [] if elements is None else np.flatnonzero(elements.valid)].astype(int).tolist()
 
 
 def _elements(elements: TrafficElements | None, ids: Identities) -> list[dict[str, Any]]:

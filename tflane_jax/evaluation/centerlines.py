@@ -11,10 +11,15 @@ from tflane_jax.scene import CenterlinePrediction, ElementPrediction, LaneGraph,
 
 
 def truth_of_centerlines(lanes: LaneGraph, elements: TrafficElements | None = None) -> LaneTruth:
-    """Return the valid lanes (and traffic elements) of one example."""
+    """Return the valid lanes (and traffic elements) of one example.
+
+    Raises ValueError if only segments are known to be governed by the elements.
+    """
     keep = np.flatnonzero(np.asarray(lanes.valid))
     truth = None
     if elements is not None:
+        if elements.lane is None:
+            raise ValueError("these traffic elements govern segments, see ExampleConfig.elements_of")
         shown = np.flatnonzero(np.asarray(elements.valid))
         truth = ElementTruth(
             boxes=np.asarray(elements.box)[shown],

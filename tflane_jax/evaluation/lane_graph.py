@@ -122,9 +122,7 @@ class LaneGraphMetrics:
             lanes = truth_of_centerlines(example.lanes, true)
             self._centerlines.update(detections, lanes, frame_group, members.get("centerlines"))
         if prediction.segments is not None:
-            # Elements govern segments, or the centerlines on which segments lie.
-            own = true is None or len(true.lane) == len(example.segments.valid)
-            segments = truth_of_segments(example.segments, example.areas, true, None if own else example.lanes)
+            segments = truth_of_segments(example.segments, example.areas, true, example.lanes)
             frame = match_segments(detections_of_segments(prediction.segments, found), segments, nearest="all")
             self._segments.add(frame, segments, frame_group, members.get("segments"))
             self._devkit.add(frame)

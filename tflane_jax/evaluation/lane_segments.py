@@ -20,7 +20,7 @@ from tflane_jax.scene import (
     SegmentPrediction,
     TrafficElements,
 )
-from tflane_jax.scene.lane_segments import segments_on_lanes
+from tflane_jax.scene.lane_segments import governed_segments
 
 SEGMENT_CLASSES = ("lane_segment", "ped_crossing")
 """Classes of LaneSegNet's queries."""
@@ -38,11 +38,11 @@ def truth_of_segments(
         segments: lane segments.
         areas: crossings and road boundaries.
         elements: traffic elements; None leaves them out.
-        lanes: centerlines, the rows of `elements.lane`; a segment is governed by the elements of the centerlines on
-            which it lies. None: the rows of `elements.lane` are the segments.
+        lanes: centerlines. Where the elements tell only these (`TrafficElements.lane`), a segment is governed by the
+            elements of the centerlines on which it lies.
 
     Raises:
-        ValueError: the number of rows of `elements.lane` is wrong.
+        ValueError: the elements tell only centerlines, and there are no `lanes`.
     """
     keep = np.flatnonzero(np.asarray(segments.valid))
     governed = None
@@ -144,15 +144,10 @@ def detections_of_areas(areas: AreaPrediction) -> AreaDetections:
 def _element_truth(
     segments: LaneGraph, elements: TrafficElements, lanes: LaneGraph | None, keep: Int[np.ndarray, " g"]
 ) -> ElementTruth:
+    if elements.segment is None and lanes is None:
+        raise ValueError("these traffic elements govern centerlines: pass `lanes`")
     shown = np.flatnonzero(np.asarray(elements.valid))
-    governs = np.asarray(elements.lane, bool)
-    owners = segments if lanes is None else lanes
-    if len(governs) != len(owners.valid):
-        what = "segments" if lanes is None else "centerlines"
-        raise ValueError(f"elements.lane has {len(governs)} rows, expected one for each of {len(owners.valid)} {what}")
-    governs = governs & np.asarray(owners.valid)[:, None]
-    if lanes is not None:
-        governs = segments_on_lanes(segments, lanes) @ governs
+    governs = governed_segments(elements, segments, segments if lanes is None else lanes)
     return ElementTruth(
         boxes=np.asarray(elements.box)[shown],
         attributes=np.asarray(elements.attribute)[shown],

@@ -119,10 +119,12 @@ class LaneSegNetLossConfig(LaneWeights, HostLossConfig):
     ) -> tuple[Float[Array, ""], Report]:
         """Return the loss of traffic elements and of their topology with the segments, and its terms."""
         elements, size = true_elements(batch)
+        if elements.segment is None:
+            raise ValueError("this loss needs traffic elements that govern segments (ExampleConfig.elements_of)")
         elements = clear_padding(elements)
         found = assign_elements(prediction, elements, size, self.elements, self.matcher)
         terms = element_losses(prediction, found, elements, size, self.elements)
-        edges = jax.vmap(partial(governed_rows, rows=segments.query.shape[-1]))(batch.segments, elements.lane)
+        edges = jax.vmap(partial(governed_rows, rows=segments.query.shape[-1]))(batch.segments, elements.segment)
         losses, counts = matched_edge_sums(
             jnp.asarray(prediction.lane_logits)[:, -1],
             _of_lanes(segments, targets),

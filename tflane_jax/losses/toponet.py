@@ -206,6 +206,8 @@ def element_lane_loss(
     """Return the weighted loss of the lane-element topology of every layer of a batch that predicts it."""
     if prediction.lane_logits is None:
         raise ValueError("this loss needs a host that predicts lane-element topology (lane_logits)")
+    if elements.lane is None:
+        raise ValueError("this loss needs traffic elements that govern centerlines (ExampleConfig.elements_of)")
     layers = prediction.lane_logits.shape[1]
     edges = elements.lane & lanes.valid[:, :, None] & elements.valid[:, None, :]
     rows, columns = last_layers(lane_assignment, layers), last_layers(element_assignment, layers)

@@ -58,13 +58,15 @@ class Example:
     def validate(self) -> None:
         """Raise AssertionError naming the first field whose shape does not fit."""
         check_shapes(self)
-        if self.traffic_elements is not None:
-            rows, lanes, segments = (
-                len(each) for each in (self.traffic_elements.lane, self.lanes.valid, self.segments.valid)
-            )
-            if rows not in (lanes, segments):
-                expected = f"one for each of {lanes} lanes, or of {segments} segments"
-                raise AssertionError(f"traffic_elements.lane has {rows} rows, expected {expected}")
+        if (elements := self.traffic_elements) is None:
+            return
+        for name, governed, lanes in (
+            ("lane", elements.lane, self.lanes),
+            ("segment", elements.segment, self.segments),
+        ):
+            if governed is not None and len(governed) != len(lanes.valid):
+                expected = f"one for each of {len(lanes.valid)} {name}s"
+                raise AssertionError(f"traffic_elements.{name} has {len(governed)} rows, expected {expected}")
 
 
 @struct.dataclass

@@ -161,28 +161,31 @@ class TrafficElements:
         box: (E, 2, 2) top-left and bottom-right pixel corners in the front image; zeros without an image.
         category: (E,) 1 traffic light, 2 road sign.
         attribute: (E,) OpenLane-V2 attribute 0 to 12.
-        lane: (N, E) element e governs lane n of the merged centerlines.
+        lane: (N, E) element e governs lane n of the merged centerlines; None if only its segments are known.
         valid: (E,).
+        segment: (S, E) element e governs segment s; None if only its centerlines are known.
     """
 
     position: Float[Array, "e 3"]
     box: Float[Array, "e 2 2"]
     category: Int[Array, " e"]
     attribute: Int[Array, " e"]
-    lane: Bool[Array, "n e"]
+    lane: Bool[Array, "n e"] | None
     valid: Bool[Array, " e"]
+    segment: Bool[Array, "s e"] | None = None
 
     @classmethod
-    def empty(cls, capacity: int, lanes: int) -> TrafficElements:
-        """Return `capacity` invalid elements for `lanes` lanes."""
+    def empty(cls, capacity: int, lanes: int | None = None, segments: int | None = None) -> TrafficElements:
+        """Return `capacity` invalid elements that govern none of so many lanes and segments; None leaves these out."""
         label = np.zeros(capacity, np.int32)
         return cls(
             position=np.zeros((capacity, 3), np.float32),
             box=np.zeros((capacity, 2, 2), np.float32),
             category=label,
             attribute=label.copy(),
-            lane=np.zeros((lanes, capacity), bool),
+            lane=None if lanes is None else np.zeros((lanes, capacity), bool),
             valid=np.zeros(capacity, bool),
+            segment=None if segments is None else np.zeros((segments, capacity), bool),
         )
 
     def validate(self) -> None:

@@ -71,9 +71,10 @@ def check_raster(source: LaneGraphSource, example: Example) -> None:
 
 
 def _check_elements(model: HostConfig, example: Example) -> None:
-    elements, lanes = example.traffic_elements, getattr(example, model.elements_of)
-    if model.elements is not None and elements is not None and len(elements.lane) != len(lanes.valid):
-        wanted = "segments" if model.elements_of == "segments" else "centerlines"
+    elements, wanted = example.traffic_elements, model.elements_of
+    if model.elements is None or elements is None:
+        return
+    if (elements.segment if wanted == "segments" else elements.lane) is None:
         raise UserError(
             f"traffic elements of these data do not govern {wanted}, which this model learns: set "
             f"data.example.elements_of={wanted} (built-in world), or the flavour of OpenLane-V2 (data.flavour)"

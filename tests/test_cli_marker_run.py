@@ -251,6 +251,7 @@ def test_the_rate_of_frames_counts_for_models_with_memory_alone(drive, tmp_path,
         (["--cameras", "7", "--ring", "nuscenes"], "--cameras is 1 to 6, the cameras of --ring nuscenes"),
         (["--frames", "0"], "--frames"),
         (["--surveyed", "soon"], "--surveyed soon is no day"),
+        (["--scale", "50"], "--scale is 50.0: it must be so small that images have at most 8192 pixels"),
     ],
 )
 def test_render_refuses_what_it_cannot_draw(tmp_path, capsys, change, words):
@@ -258,3 +259,10 @@ def test_render_refuses_what_it_cannot_draw(tmp_path, capsys, change, words):
     assert main(arguments) == 2
     assert words in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+def test_two_drives_do_not_share_a_folder(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(marker_run, "simulate", lambda *_: pytest.fail("simulated"))
+    (tmp_path / "images").mkdir()
+    assert main(["markers", "render", "--log", "1", "--out", str(tmp_path)]) == 2
+    assert "is not empty: choose another folder" in capsys.readouterr().err

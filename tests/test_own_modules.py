@@ -111,7 +111,10 @@ def test_a_run_with_an_own_class_is_read_back_after_its_import(monkeypatch):
 
 def test_the_imports_that_a_run_needs_are_told():
     assert own_modules.imports_of(RunConfig()) == ""
-    assert own_modules.imports_of(own_loss("ToldLossConfig", Path("sub"))) == " --import module_ToldLossConfig"
+    assert own_modules.imports_of(own_loss("ToldLossConfig")) == " --import module_ToldLossConfig"
+    assert own_modules.imports_of(own_loss("SubLossConfig", Path("sub"))) == " --import sub/module_SubLossConfig.py"
+    spaced = own_modules.imports_of(own_loss("SpacedLossConfig", Path("my own")))
+    assert spaced == " --import 'my own/module_SpacedLossConfig.py'"
     Path("one_file.py").write_text(LOSS.format(name="FileLossConfig") + CONFIG.format(name="FileLossConfig"))
     assert own_modules.imports_of(load_config("one_file.py")) == " --import one_file.py"
 

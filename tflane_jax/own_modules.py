@@ -15,6 +15,7 @@ import importlib.abc
 import importlib.machinery
 import importlib.util
 import os
+import shlex
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -28,6 +29,8 @@ VARIABLE = "TFLANE_IMPORT"
 _FILES = "TFLANE_FILES"
 """Environment variable for processes that this one starts: files that it has imported, one a line."""
 _PREFIX = "tflane_file_"
+# Folders that were added to those in which modules are found because a file there was imported.
+_beside: set[str] = set()
 
 
 def take_imports(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
@@ -92,6 +95,7 @@ def import_file(path: Path, *, beside: bool = True) -> ModuleType:
         os.environ[_FILES] = "\n".join([*known, str(path)])
     if beside:
         look_in(path.parent)
+        _beside.add(str(path.parent))
     return importlib.import_module(_module_name(path))
 
 
@@ -101,13 +105,17 @@ def imports_of(config: Any) -> str:
     Args:
         config: a dataclass, whose settings may be dataclasses of the user.
     """
-    found: dict[str, None] = {}
-    for kind in _classes(config):
-        if _is_own(kind):
-            module = sys.modules[kind.__module__]
-            own_file = kind.__module__.startswith(_PREFIX)
-            found[os.path.relpath(str(module.__file__)) if own_file else kind.__module__] = None
-    return "".join(f" --import {name}" for name in found)
+    found = dict.fromkeys(_importable(kind.__module__) for kind in _classes(config) if _is_own(kind))
+    return "".join(f" --import {shlex.quote(name)}" for name in found)
+
+
+def _importable(module: str) -> str:
+    """Return by what another command finds a module: its name, or its file if only a file beside it was looked for."""
+    file = sys.modules[module].__file__
+    if file is None:
+        return module
+    beside = os.path.dirname(file) in _beside and not os.path.samefile(os.path.dirname(file), os.getcwd())
+    return os.path.relpath(file) if beside or module.startswith(_PREFIX) else module
 
 
 def own_content(config: Any) -> str:

@@ -35,7 +35,7 @@ from tflane_jax.datasets.marker_cache import search_views
 from tflane_jax.datasets.marker_observations import store_of_log
 from tflane_jax.datasets.native_views import fitted_views
 from tflane_jax.errors import UserError
-from tflane_jax.files.atomic import check_folder, write_bytes, write_json
+from tflane_jax.files.atomic import check_folder, replacing, write_bytes, write_json
 from tflane_jax.files.images import opencv
 from tflane_jax.geometry import PerceptionRange, invert_pose
 from tflane_jax.limits import check_settings
@@ -49,6 +49,7 @@ from tflane_jax.plots.marker_drive import board_outline, frame_title, save_drive
 from tflane_jax.progress import progress_bar
 from tflane_jax.runs import open_run
 from tflane_jax.scene import CameraViews
+from tflane_jax.scene.logs import Log
 from tflane_jax.scene.marker_patterns import MarkerFamily, marker_count
 from tflane_jax.tasks.lane_pictures import lanes_of
 from tflane_jax.tasks.marker_drive import DriveModel, DriveStep, MarkerDrive, as_trained, check_model, check_rate
@@ -263,22 +264,33 @@ def render(options: argparse.Namespace) -> int:
     if not 1 <= options.cameras <= len(ring):
         raise UserError(f"--cameras is 1 to {len(ring)}, the cameras of --ring {options.ring}, not {options.cameras}")
     boards = PlacementConfig(side="both", site="clear")
+    rig = CameraRigConfig(cameras=ring[: options.cameras], scale=options.scale, markers=True)
+    check_settings(rig, "--")
     check_folder(options.out)
+    if options.out.is_dir() and any(options.out.iterdir()):
+        raise UserError(f"{options.out} is not empty: choose another folder (--out), images of two drives would mix")
     # Two seconds of history come before the first frame.
     world = WorldConfig(duration_s=1.6 + 0.5 * options.frames, keyframes=options.frames, markers=boards)
     log = simulate(options.log, world)
     store = store_of_log(log, radius=50.0, bike_lanes=True, surveyed=surveyed)
     if not store.markers:
         raise UserError(f"{log.name} has no junction, split or merge, and so no marker: take another --log")
-    mounts = ring[: options.cameras]
-    rig = CameraRigConfig(cameras=mounts, scale=options.scale, markers=True)
-    check_settings(rig, "--")
-    cv2, images = opencv(), options.out / "images"
-    make_folder(images)
-    frames = []
+    with replacing(options.out) as folder:
+        _render(log, rig, store, folder)
+    print(
+        f"{options.frames} frames of {options.cameras} cameras written to {options.out}: images/, poses.json, "
+        "store.json"
+    )
+    return 0
+
+
+def _render(log: Log, rig: CameraRigConfig, store: MarkerStore, folder: Path) -> None:
+    """Write images, poses and store of a drive."""
+    cv2, images, frames = opencv(), folder / "images", []
+    images.mkdir(parents=True)
     for number, moment in enumerate(progress_bar(log.keyframes, desc="render", unit="frame")):
         views, files = render_cameras(log, number, rig), {}
-        for place, mount in enumerate(mounts):
+        for place, mount in enumerate(rig.cameras):
             width, height = views.size[place].tolist()
             files[mount.name] = images / f"{number:03d}-{mount.name}.png"
             picture = np.asarray(views.image)[place, :height, :width, ::-1]
@@ -286,9 +298,7 @@ def render(options: argparse.Namespace) -> int:
         frames.append(DriveFrame(moment.timestamp_ns, moment.global_from_ego, files))
     cameras = tuple(
         DriveCamera(mount.name, camera.intrinsics, invert_pose(camera.camera_from_ego))
-        for mount, camera in zip(mounts, draw_rig(log.seed, rig), strict=True)
+        for mount, camera in zip(rig.cameras, draw_rig(log.seed, rig), strict=True)
     )
-    save_drive(Drive(cameras, tuple(frames)), options.out / "poses.json", images)
-    save_store(store, options.out / "store.json")
-    print(f"{len(frames)} frames of {len(mounts)} cameras written to {options.out}: images/, poses.json, store.json")
-    return 0
+    save_drive(Drive(cameras, tuple(frames)), folder / "poses.json", images)
+    save_store(store, folder / "store.json")

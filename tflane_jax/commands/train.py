@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import shlex
 import signal
 import sys
 from collections.abc import Mapping, Sequence
@@ -49,7 +50,7 @@ def _trained(options: argparse.Namespace, overrides: Sequence[str]) -> int:
     config = _config(options, out, overrides)
     _print_devices()
     before, own = _saved_at(out), imports_of(config)
-    resume = f"go on with: tflane train --resume --out {out}{own}"
+    resume = f"go on with: tflane train --resume --out {shlex.quote(str(out))}{own}"
     try:
         result = train_run(config, out, start=options.start)
     except KeyboardInterrupt as error:
@@ -72,7 +73,7 @@ def _trained(options: argparse.Namespace, overrides: Sequence[str]) -> int:
         print("\n" + score_table(result.metrics, f"last evaluation, validation split{several}") + "\n")
     if (out / "curves.png").exists():
         print(f"pictures: {out / 'curves.png'}, {out / 'pictures'}")
-    print(f"evaluate with: tflane eval {out}{own}")
+    print(f"evaluate with: tflane eval {shlex.quote(str(out))}{own}")
     return 0
 
 

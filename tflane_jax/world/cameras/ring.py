@@ -23,6 +23,8 @@ ROOT = 20_251_121
 _FOCAL, _CENTRE, _PLACE, _ANGLE = 0.003, 0.004, 0.01, 0.35
 # Images below this fraction of the native size are drawn twice as large and averaged.
 _SMALL = 0.35
+# Pixels: a frame of seven such images takes some gigabytes to draw.
+_LARGEST = 8192
 
 
 @dataclass(frozen=True)
@@ -109,9 +111,10 @@ class CameraRigConfig:
         return width, height
 
     def limits(self) -> Rules:
-        """Images are not too small to show anything."""
+        """Images are not too small to show anything, nor too large to be drawn."""
         sizes = [size for mount in self.cameras for size in self.size(mount)]
         yield "scale", min(sizes) >= 8, "so large that images have at least 8 pixels in each direction"
+        yield "scale", max(sizes) <= _LARGEST, f"so small that images have at most {_LARGEST} pixels in each direction"
 
 
 @functools.lru_cache(maxsize=16)

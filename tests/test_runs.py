@@ -118,6 +118,25 @@ def test_a_configuration_that_was_edited_to_another_model_is_named(config, tmp_p
         evaluate_run(run, config.data.source("test"), progress=False)
 
 
+def test_changes_of_a_runs_configuration_that_have_no_effect_are_told(config, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(LaneGraphTask, "init", lambda task, key, example: {"scale": jnp.ones(3)})
+    folder = tmp_path / "run"
+    save_weights(config, {"scale": jnp.ones(3)}, folder)
+    open_run(folder)
+    saved = to_json(config)
+    here = saved | {"training": saved["training"] | {"shard_state": not saved["training"]["shard_state"]}}
+    (folder / "config.json").write_text(json.dumps(here))
+    open_run(folder)  # a resumed run may change where its state is held
+    (folder / "config.json").write_text("{")
+    open_run(folder)
+    assert capsys.readouterr().err == ""
+    (folder / "config.json").write_text(json.dumps(saved | {"optim": saved["optim"] | {"lr": 0.5}}))
+    assert open_run(folder).config == config
+    said = capsys.readouterr().err
+    assert "config.json was changed (optim.lr: 0.5 there, " in said
+    assert "the configuration of the checkpoints counts" in said
+
+
 def test_the_current_form_of_a_configuration_is_itself(config):
     assert current_form(to_json(config)) == (to_json(config), [])
 

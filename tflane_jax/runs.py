@@ -37,7 +37,7 @@ from tflane_jax.training.fine_tuning import check_origins
 from tflane_jax.training.loop import Draw, TrainingResult, train
 from tflane_jax.training.provenance import add_provenance
 from tflane_jax.training.records import Record, by_name
-from tflane_jax.training.run_folder import Start, check_start, check_unchanged, claimed, read_config
+from tflane_jax.training.run_folder import Start, check_start, check_unchanged, claimed, read_config, unused_changes
 from tflane_jax.training.schedule import make_optimizer, scaled_to_batch
 from tflane_jax.training.state import per_seed, state_of
 
@@ -215,7 +215,7 @@ def open_run(folder: Path | str, which: Which | None = None) -> Run:
     plain = Checkpoints(folder / "checkpoints")
     last = plain.find("last")
     config, notices = _read_config(plain.path(last) / "manifest.json", plain.manifest(last).config)
-    for notice in notices:
+    for notice in [*notices, *unused_changes(folder, to_json(config), current_form)]:
         print(notice, file=sys.stderr)
     checkpoints = Checkpoints(folder / "checkpoints", best_metric=config.training.best_metric)
     if which is None:

@@ -90,6 +90,21 @@ def check_unchanged(folder: Path, resolved: dict[str, Any], current_form: Curren
     return notices
 
 
+def unused_changes(folder: Path, used: dict[str, Any], current_form: CurrentForm) -> list[str]:
+    """Return a notice if config.json is not the configuration (JSON) of the run's checkpoints, which is used."""
+    try:
+        saved, _ = current_form(read_config(folder))
+    except UserError:  # only the checkpoints are needed
+        return []
+    difference = first_difference(fixed(with_same_origin(saved, used, folder)), fixed(used))
+    if not difference:
+        return []
+    return [
+        f"{folder / 'config.json'} was changed ({difference}): the configuration of the checkpoints counts. For other "
+        "settings, train from the run (training.init_from)"
+    ]
+
+
 def with_same_origin(saved: dict[str, Any], resolved: dict[str, Any], folder: Path) -> dict[str, Any]:
     """Return a saved configuration (JSON) with `training.init_from` as `resolved` has it, where both mean one run.
 

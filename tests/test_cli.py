@@ -194,7 +194,7 @@ def test_several_seeds_are_evaluated_with_mean_and_deviation(config, tmp_path):
         (["train", "--config", "CONFIG", "--optim.lr", "high"], "--optim.lr is 'high': it must be a number"),
         (["train", "--config", "CONFIG:no_such"], "has no ablation no_such, only baseline"),
         (["eval", "nowhere"], "nowhere does not exist: the first argument is a run folder"),
-        (["eval", "RUN", "--checkpoint", "77"], "has no checkpoint of step 77, only 2, 4"),
+        (["eval", "RUN", "--checkpoint", "77"], "has no checkpoint of step 77, only [2, 4, 'last', 'best']"),
         (["eval", "RUN", "--data", "argoverse2"], "needs --root"),
         (["eval", "RUN", "--root", "logs"], "add --data argoverse2"),
         (["predict", "RUN", "--out", "RUN/config.json"], "config.json is no folder"),

@@ -117,6 +117,8 @@ def test_intrinsics_of_another_image_size_are_a_fault(photos, tmp_path, capsys):
         (["--enlarge", "0"], "tflane: --enlarge is 0: it must be"),
         (["--height", "nan"], "tflane: --height takes finite numbers"),
         (["--pitch", "inf"], "tflane: --pitch takes finite numbers"),
+        (["--height", "-1"], "tflane: --height is that of the camera above the ground, metres, above 0, not -1"),
+        (["--pitch", "91"], "tflane: --pitch is from -90 to 90 degrees, not 91"),
         (["--distortion", "0.1", "nan", "0", "0"], "tflane: --distortion takes finite numbers"),
         (["--intrinsics", "900", "900", "nan", "1"], "tflane: --intrinsics takes finite numbers"),
     ],

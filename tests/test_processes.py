@@ -205,6 +205,15 @@ def test_flags_that_make_no_sense_are_refused(given, said):
         processes.join(*given)
 
 
+def test_outside_of_a_cluster_the_options_are_named(monkeypatch):
+    def initialize(*_, **__):
+        raise ValueError("coordinator_address should be defined.")
+
+    monkeypatch.setattr("jax.distributed.initialize", initialize)
+    with pytest.raises(UserError, match="no cluster's job was found .*: give each process --coordinator HOST:PORT"):
+        processes.join(None, None, None)
+
+
 def test_a_process_on_its_own_is_the_first():
     assert (processes.count(), processes.is_first()) == (1, True)
     assert processes.from_first(lambda: {"a": [1, None]}) == {"a": [1, None]}

@@ -28,6 +28,8 @@ _SYNONYMS = {
 _NO_NUMBER = re.compile(
     r"Error parsing (--\S+): (?:(invalid literal for int\(\) with base 10)|could not convert string to float): ('.*')"
 )
+# Its message about arguments that no option takes.
+_LEFT_OVER = "Unrecognized options: "
 
 
 def apply_overrides(config: RunConfig, arguments: Sequence[str]) -> RunConfig:
@@ -139,6 +141,7 @@ def _setting(argument: str) -> str:
 def _checked_names(config: RunConfig, arguments: Sequence[str]) -> set[str]:
     """Return the settings that arguments change; raise UserError for one that there is not."""
     values = {name: value for name, value in settings(config) if not dataclasses.is_dataclass(value)}
+    parts = {name for name, value in settings(config) if dataclasses.is_dataclass(value)}
     known, found = list(values), set()
     for argument, following in itertools.zip_longest(arguments, arguments[1:], fillvalue="--"):
         if not (name := _setting(argument)):
@@ -146,6 +149,11 @@ def _checked_names(config: RunConfig, arguments: Sequence[str]) -> set[str]:
         setting = name if name in known else name.replace(".no_", ".")  # of a flag: --a.no-b
         if setting not in known:
             turned = re.sub(r"^no_(.*\.|)", r"\1no_", name).replace("_", "-")  # --no-a.b for --a.no-b
+            if not following.startswith("--") and following[:1].isupper() and name in parts:
+                raise UserError(
+                    f"--{name} {following}: there is no such class of settings here; import the module of an own one, "
+                    "--import MODULE"
+                )
             close = [turned] if name.removeprefix("no_") in known else _closest(name, known)
             hint = f"did you mean {' or '.join(f'--{c}' for c in close)}?" if close else "see --help for all settings"
             raise UserError(f"unknown setting --{name}: {hint}")
@@ -177,6 +185,9 @@ def _without_boxes(text: str) -> str:
     lines = [re.sub(r"[│─╭╮╰╯]|-{3,}", " ", line).strip() for line in text.splitlines()[1:]]
     paragraphs = re.split(r"\n{2,}", "\n".join(lines).strip())
     message = paragraphs[0].replace("\n", " ")
+    if message.startswith(_LEFT_OVER):
+        first = message.removeprefix(_LEFT_OVER).split()[0]
+        return f"{first} is neither a setting nor the value of one: settings are given as, say, --optim.lr 1e-3"
     if (wrong := _NO_NUMBER.search(message)) is None:
         return message
     name, whole, value = wrong.groups()

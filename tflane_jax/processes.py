@@ -75,6 +75,11 @@ def join(coordinator: str | None, processes: int | None, process: int | None) ->
             heartbeat_timeout_seconds=HEARTBEAT_SECONDS,
         )
     except (RuntimeError, ValueError) as error:
+        if ask and "coordinator_address" in str(error):
+            raise UserError(
+                "no cluster's job was found in which to join other processes (Slurm, Open MPI, Kubernetes, Cloud TPU): "
+                "give each process --coordinator HOST:PORT, --processes and --process, or leave --distributed out"
+            ) from error
         raise UserError(f"the processes of this training cannot be joined: {str(error).splitlines()[0]}") from error
     jax.config.update("jax_enable_compilation_cache", False)
 

@@ -131,7 +131,7 @@ def test_a_checkpoint_that_is_dropped_while_it_is_read_is_not_the_best(tmp_path,
 
 @pytest.mark.parametrize(
     ("which", "message"),
-    [("best", "ask for `last`"), (7, "no checkpoint of step 7, only 4")],
+    [("best", "ask for `last`"), (7, r"no checkpoint of step 7, only \[4, 'last', 'best'\]")],
 )
 def test_a_missing_checkpoint_is_an_error(tmp_path, state, which, message):
     with pytest.raises(UserError, match=message):

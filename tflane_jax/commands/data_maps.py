@@ -38,6 +38,8 @@ class _Chosen:
 def run(options: argparse.Namespace) -> int:
     """Draw the frames of recorded logs and of the world on their maps, a row for each log."""
     check_writable(options.out)
+    if options.scene < 0:
+        raise UserError(f"--scene is the number of a scene, 0 or more, not {options.scene}")
     logs = [one.name for one in chosen_maps(options.root, options.logs) if one.recorded]
     if not logs:
         raise UserError(f"{options.root} holds maps without recordings: tflane data show --data real-maps draws those")

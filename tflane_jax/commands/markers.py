@@ -66,6 +66,10 @@ def find(options: argparse.Namespace) -> int:
     for name in ("intrinsics", "distortion", "height", "pitch"):
         if not np.isfinite(getattr(options, name) or 0.0).all():
             raise UserError(f"--{name} takes finite numbers, not nan or inf")
+    if not options.height > 0.0:
+        raise UserError(f"--height is that of the camera above the ground, metres, above 0, not {options.height:g}")
+    if not abs(options.pitch) <= 90.0:
+        raise UserError(f"--pitch is from -90 to 90 degrees, not {options.pitch:g}")
     intrinsics, pose = _intrinsics(options.intrinsics), camera_pose(options.height, np.deg2rad(options.pitch))
     make_folder(options.out)
     rows, records, faults, twice = [], [], [], []
@@ -110,6 +114,7 @@ def curves(options: argparse.Namespace) -> int:
         raise UserError(f"--scales are positive fractions of the native image size, not {min(options.scales):g}")
     if not options.sigma_d > 0.0:
         raise UserError(f"--sigma-d must be a positive distance in metres, not {options.sigma_d:g}")
+    check_folder(options.out)
     configs = {scale: [_curve(options, scale, corners) for corners in options.corners] for scale in options.scales}
     make_folder(options.out)
     drawn: dict[str, list[dict[str, Any]]] = {}

@@ -43,6 +43,8 @@ def opened(options: argparse.Namespace) -> tuple[Run, list[Path]]:
     if options.config is not None:
         if options.checkpoint is not None:
             raise UserError(f"--checkpoint {options.checkpoint} is of a run: published weights (--config) have but one")
+        if options.inputs and (options.inputs[0] / "config.json").is_file():
+            raise UserError(f"{options.inputs[0]} is a run, which has its own configuration: leave --config out")
         config = load_config(options.config)
         return open_weights(replace(config, weights=options.weights or config.weights)), options.inputs
     if options.weights is not None:

@@ -173,7 +173,7 @@ class Checkpoints:
             wanted = f"the score {self._best_metric} (training.best_metric)" if self._best_metric else "a score"
             raise UserError(f"no checkpoint in {self.folder} has {wanted}, so none is best: ask for `last`")
         if step not in steps:
-            raise UserError(f"{self.folder} has no checkpoint of step {step}, only {', '.join(map(str, steps))}")
+            raise UserError(f"{self.folder} has no checkpoint of step {step}, only {[*steps, 'last', 'best']}")
         return step
 
     def restore(self, step: int, template: TrainState) -> TrainState:

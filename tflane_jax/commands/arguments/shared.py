@@ -27,7 +27,8 @@ class SourceName:
 
     def __call__(self, text: str) -> str:
         if text not in SourceName().names():
-            raise argparse.ArgumentTypeError(f"{text!r} is none of {', '.join(self.names())}")
+            own = "an own one: import its module, --import MODULE"
+            raise argparse.ArgumentTypeError(f"{text!r} is none of {', '.join(self.names())} ({own})")
         return text
 
 

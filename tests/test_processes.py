@@ -210,7 +210,7 @@ def test_outside_of_a_cluster_the_options_are_named(monkeypatch):
         raise ValueError("coordinator_address should be defined.")
 
     monkeypatch.setattr("jax.distributed.initialize", initialize)
-    with pytest.raises(UserError, match="no cluster's job was found .*: give each process --coordinator HOST:PORT"):
+    with pytest.raises(UserError, match=r"no cluster's job was found .*: give each process --coordinator HOST:PORT"):
         processes.join(None, None, None)
 
 

@@ -151,6 +151,7 @@ WRONG = {
         "task.model.priors.markers.heads": (7,),
     },
     "gtn_lane/gtn": {
+        "training.best_metric": ("all/loss", "all/FN"),
         "task.model.dim": (30,),
         "task.model.queries": (0,),
         "task.model.encoder.channels": (5,),

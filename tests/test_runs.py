@@ -153,6 +153,10 @@ def test_the_current_form_of_a_configuration_is_itself(config):
             {"optim": {"restarts": RestartsConfig(adaptive=AdaptiveConfig(metric="loss"))}},
             r"optim\.restarts\.adaptive\.metric is 'loss'",
         ),
+        (
+            {"optim": {"restarts": RestartsConfig(adaptive=AdaptiveConfig(metric="all/DET_l"))}},
+            r'optim\.restarts\.adaptive\.mode is \'min\': it must be "max" for all/DET_l',
+        ),
     ],
 )
 def test_scores_are_checked_by_name_before_anything_is_done(config, tmp_path, changes, message, monkeypatch):
@@ -169,6 +173,8 @@ def test_the_scores_that_an_evaluation_gives_are_known_before(config, tmp_path):
     scores = config.task.evaluate(open_run(tmp_path / "run").params[0], examples, config.evaluation).scores().keys()
     # The examples lack some groups of lanes, of which nothing is recorded.
     assert {name for name in scores if name.startswith(("all/", "clear/"))} < recorded.keys() < scores
+    first = config.task.score_names(config.data, replace(config.evaluation, versions=("v1.0", "v2.1")))
+    assert {"all/TOP_ll", "all/TOP_ll_v2.1"} <= first  # v1.0 gives none without lanes
     # The fake model predicts traffic elements, the configuration's does not.
     of_lanes = {name for name in scores if not name.startswith(("all/DET_t", "all/TOP_lt", "all/OLS"))}
     assert of_lanes == config.task.score_names(config.data, config.evaluation) < scores

@@ -13,6 +13,7 @@ from tflane_jax.config_io import settings
 from tflane_jax.datasets.sources import source_of
 from tflane_jax.errors import UserError
 from tflane_jax.limits import SettingError, check_settings
+from tflane_jax.metrics.directions import lower_is_better
 from tflane_jax.models.parameters import Params, first_misfit, split_statistics
 from tflane_jax.scene import Example, RoadImage, shapes_of
 from tflane_jax.tasks.base import AnyTask
@@ -113,6 +114,12 @@ def _check_scores(config: RunConfig) -> None:
             close = difflib.get_close_matches(name, sorted(known), 3)
             hint = f"; did you mean {' or '.join(close)}?" if close else ""
             raise SettingError(setting, name, f"a score that the evaluation computes: choose one of {listed}{hint}")
+    if lower_is_better(config.training.best_metric, config.task.errors):
+        raise SettingError("training.best_metric", config.training.best_metric, "a score where higher is better")
+    if adaptive is not None:
+        mode = "min" if lower_is_better(adaptive.metric, config.task.errors) else "max"
+        if adaptive.mode != mode:
+            raise SettingError("optim.restarts.adaptive.mode", adaptive.mode, f'"{mode}" for {adaptive.metric}')
 
 
 def _check_files(config: RunConfig) -> None:

@@ -160,6 +160,27 @@ def test_the_record_of_a_table_in_training_keeps_the_runs_of_others(tiny, made, 
         process([first])
 
 
+def test_the_record_of_a_finished_table_keeps_the_runs_of_other_seeds(tiny, tmp_path):
+    """Regression: it held those of the last choice of seeds."""
+    for seed in (0, 1):
+        run_table(small(tiny), [seed], tmp_path)
+    found = read_archive(tmp_path / "paper.9" / FILE).runs.values()
+    assert {run.seed for run in found} == {0, 1}
+
+
+def test_a_table_of_fewer_seeds_does_not_replace_a_recorded_one(tiny, made, tmp_path, capsys):
+    """Its runs enter the record; its tests would be of fewer runs than are recorded."""
+    results = tmp_path / "results"
+    shutil.copytree(made.with_name("results"), results)
+    before = (results / "paper.9.json").read_bytes()
+    path = run_table(small(tiny, seeds=3), [2], tmp_path / "other", archive=recorded(results))
+    page = record([path.with_name("summary.json")], results)
+    assert (results / "paper.9.json").read_bytes() == before
+    assert {run.seed for run in recorded(results).runs.values()} == {0, 1, 2}
+    assert "the runs of seeds 2 were added to the record; its table stays that of before" in capsys.readouterr().out
+    assert "2 seeds" in page.read_text()
+
+
 def test_a_table_half_from_its_record_is_that_of_all_runs(tiny, made, tmp_path, monkeypatch):
     whole = recorded(made.with_name("results"))
     first = replace(whole, runs={key: run for key, run in whole.runs.items() if run.seed == 0})

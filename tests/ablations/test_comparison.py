@@ -55,7 +55,7 @@ def test_a_variant_is_paired_over_the_seeds_that_the_control_has():
 
 def test_lower_errors_are_better():
     table = {"base": scores(0.1, 0.2, 0.3), "prior": scores(0.05, 0.1, 0.4)}
-    (_, row) = summarise(table, ["all/DET_l"], errors=["all/DET_l"])
+    (_, row) = summarise(table, ["all/DET_l"], errors=["DET_l"])
     assert row["seeds better"] == "2 of 3"
     assert row["difference"] == pytest.approx(-0.05 / 3)
 

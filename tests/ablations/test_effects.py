@@ -86,7 +86,7 @@ def test_findings(results):
         "matched, none": "contradicted",
     }
     # The same numbers, read as errors.
-    as_errors = {e.row: (e.finding, e.better) for e in effects(results, worse, "", "last", [PRIMARY])}
+    as_errors = {e.row: (e.finding, e.better) for e in effects(results, worse, "", "last", ["recall"])}
     assert as_errors["+TFM"] == ("shown", 4)
     strict = Declaration(PRIMARY, (Claim("+TFM"),), alpha=1e-9)
     assert {e.finding for e in effects(results, strict, "", "last")} == {"not shown"}
@@ -94,7 +94,7 @@ def test_findings(results):
 
 def test_numbers_read_as_errors_are_the_same_but_for_what_is_better(results):
     for score, error in zip(
-        *(effects(results, DECLARED, "", "last", errors) for errors in ([], [PRIMARY])), strict=True
+        *(effects(results, DECLARED, "", "last", errors) for errors in ([], ["recall"])), strict=True
     ):
         for name in ("difference", "low", "high", "seeds_low", "seeds_high", "p"):
             assert getattr(error, name) == pytest.approx(getattr(score, name), rel=1e-9), name
@@ -307,7 +307,7 @@ def test_a_secondary_measure_is_corrected_apart(results):
     assert text.startswith(f"**shown**: +TFM is better than *baseline* in {PRIMARY}, +")
     assert "; not shown in the secondary measure all/AP_l, " in text
     # Read as errors, its sign alone turns.
-    as_errors = effects(results, more, "", "last", ["all/AP_l"])
+    as_errors = effects(results, more, "", "last", ["AP_l"])
     assert repr(as_errors[: len(plain)]) == repr(plain)
     assert [e.better for e in as_errors[len(plain) :]] == [len(SEEDS) - e.better for e in extra]
 
@@ -315,3 +315,29 @@ def test_a_secondary_measure_is_corrected_apart(results):
 def test_a_score_that_was_not_measured_is_named(results):
     with pytest.raises(UserError, match="the run of seed 0 has no all/mAP: an earlier state of the code"):
         effects(results, Declaration("all/mAP", (Claim("+TFM"),)), "", "last")
+
+
+@pytest.mark.parametrize("score", ["all/loss", "all/FN", "clear/AE_dist", "segments all/AE_type"])
+def test_the_row_with_the_larger_error_is_not_better(score):
+    found = Results(("base", "new"), SEEDS, {})
+    for seed in SEEDS:
+        for row, value in (("base", 0.2 + 0.001 * seed), ("new", 0.4 + 0.002 * seed)):
+            found.add("", "last", row, seed, Measured(1, "p", {"": {score: value}}, {"": {}}))
+    (effect,) = effects(found, Declaration(score, (Claim("new"),)), "", "last")
+    assert (effect.better, effect.finding) == (0, "contradicted")
+
+
+def test_an_error_and_a_score_that_gain_alike_differ_by_nothing():
+    primary, control = "all/Accuracy", "all/FP"
+    rng, found = np.random.default_rng(0), Results(("base", "new"), SEEDS, {})
+    for seed in SEEDS:
+        noise = rng.normal(0, 1e-3, 4)
+        for row, gain, (a, b) in (("base", 0.0, noise[:2]), ("new", 0.02, noise[2:])):
+            scores = {primary: 0.9 + gain + a, control: 0.1 - gain + b}
+            found.add("", "last", row, seed, Measured(1, "p", {"": scores}, {"": {}}))
+    declared = Declaration(primary, (Claim("new"),), control)
+    by_measure = {effect.measure: effect for effect in effects(found, declared, "", "last")}
+    assert by_measure[primary].finding == by_measure[f"negative control {control}"].finding == "shown"
+    difference = by_measure["difference of the two"]
+    assert difference.finding == "not shown"
+    assert abs(difference.difference) < 0.005

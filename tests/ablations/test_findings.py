@@ -81,3 +81,33 @@ def test_where_every_row_but_one_failed_all_comparisons_are_named(tmp_path):
     assert said[0].startswith("**not tested** (no run of +TFM was measured (out of memory)): +TFM is better than *bas")
     assert "(no run of +TFM was measured (out of memory) and no run of matched was measured)" in said[1]
     assert len(said) == 2
+
+
+def test_models_that_are_measured_by_several_protocols_are_named(results, tmp_path):
+    by_heights = [replace(measured(seed, own=(0.5, 0.3)), protocol="with heights") for seed in SEEDS]
+    results = Results(("flat", "heights"), SEEDS, {})
+    for seed, own in zip(SEEDS, by_heights, strict=True):
+        results.add("", "last", "flat", seed, measured(seed, own=(0.3, 0.3)))
+        results.add("", "last", "heights", seed, own)
+    assert results.mixed_protocols("") == (
+        "**Different protocols** (flat by a protocol; heights by with heights): where these differ, scores of one name "
+        "are not comparable."
+    )
+    assert results.mixed_protocols("rain") == ""
+    declared = Declaration(PRIMARY, (Claim("heights"),))
+    tested = judged_claims(results, declared, "")
+    path = save_effects(results, Declared(declared, SEEDS, "now", 0), "", tested, tmp_path / "effects")
+    assert "**Different protocols** (flat by" in path.read_text()
+
+
+def test_runs_without_a_best_checkpoint_are_no_interim_look(tmp_path):
+    results = Results(("baseline", "+TFM"), SEEDS, {})
+    for seed in SEEDS:
+        for which in ("last", "best") if seed else ("last",):
+            results.add("", which, "baseline", seed, measured(seed, own=(0.3, 0.3)))
+            results.add("", which, "+TFM", seed, measured(seed, own=(0.6, 0.3)))
+    declared = Declaration(PRIMARY, (Claim("+TFM"),))
+    path = save_effects(
+        results, Declared(declared, SEEDS, "now", 0), "", judged_claims(results, declared, ""), tmp_path / "x"
+    )
+    assert "Interim" not in path.read_text()

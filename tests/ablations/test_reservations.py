@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 import threading
+import time
 
 import pytest
 
@@ -128,3 +129,15 @@ def test_a_folder_that_cannot_be_written_is_named(tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(UserError, match="cannot write"):
         Reservations().take(tmp_path / "file" / "seed_0")
+
+
+def test_a_process_that_slept_does_not_renew_the_reservation_of_its_successor(tmp_path, monkeypatch):
+    run = tmp_path / "seed_0"
+    monkeypatch.setattr(reservations, "RENEW_SECONDS", 0.01)
+    with Reservations() as sleeper:
+        sleeper.take(run)
+        reserved(run).unlink()  # it was void, and another process took the run
+        assert Reservations().take(run)
+        os.utime(reserved(run), (1.0, 1.0))
+        time.sleep(0.1)
+        assert reserved(run).stat().st_mtime == 1.0

@@ -228,9 +228,10 @@ def _tests(found: ByLog, logs: Sequence[str], declared: Declared) -> list[dict[s
             np.array([found[name][log][declaration.primary] for log in logs]) for name in (treatment, control)
         )
         test = paired_difference(100.0 * treated, 100.0 * plain)
-        chances.append(test.p_value)
+        chances.append(1.0 if np.isnan(test.p_value) else test.p_value)
+        why = "one log" if len(logs) < 2 else f"{declaration.primary} is no number on some log"
         row |= {"difference": test.mean, "std": test.std, "logs better": f"{test.better} of {test.seeds}"}
-        rows.append(row | {"p": test.p_value, "reason": "one log" if np.isnan(test.p_value) else ""})
+        rows.append(row | {"p": test.p_value, "reason": why if np.isnan(test.p_value) else ""})
     for row, corrected in zip(rows, holm(chances), strict=True):
         if reason := row.pop("reason"):
             row |= {"p (Holm)": math.nan, "verdict": f"not tested ({reason})"}

@@ -9,13 +9,14 @@ import numpy as np
 from jaxtyping import Float
 
 from tflane_jax.ablations.statistics import holm, paired_difference
+from tflane_jax.metrics.directions import ERRORS, lower_is_better
 
 Scores = dict[str, float]
 """Metrics by "group/name", as `evaluation.results.Evaluation.scores` returns them."""
 
 
 def summarise(
-    rows: Mapping[str, Mapping[int, Scores]], metrics: Sequence[str], errors: Collection[str] = ()
+    rows: Mapping[str, Mapping[int, Scores]], metrics: Sequence[str], errors: Collection[str] = ERRORS
 ) -> list[dict[str, Any]]:
     """Return one row for each metric and variant: mean, standard deviation, and the difference to the first variant.
 
@@ -26,7 +27,7 @@ def summarise(
     Args:
         rows: scores by seed of each variant; the first one is the control.
         metrics: names as in `Scores`.
-        errors: metrics where lower is better.
+        errors: metrics where lower is better, without their group.
     """
     found, (control, *_) = [], rows
     for metric in metrics:
@@ -37,7 +38,7 @@ def summarise(
                 treated, other = (_column([rows[one][seed] for seed in seeds], metric) for one in (name, control))
                 test = paired_difference(treated, other)
                 row |= {"difference": test.mean, "std of difference": test.std, "p": test.p_value}
-                better = paired_difference(other, treated).better if metric in errors else test.better
+                better = paired_difference(other, treated).better if lower_is_better(metric, errors) else test.better
                 row["p (Holm)"], row["seeds better"] = None, f"{better} of {test.seeds}"
             found.append(row)
     tested = [row for row in found if "p" in row]

@@ -30,6 +30,7 @@ from tflane_jax.ablations.statistics import holm, interval, paired_difference, r
 from tflane_jax.errors import UserError
 from tflane_jax.evaluation.by_scene import scene_weights
 from tflane_jax.evaluation.results import SceneRatio, SceneSamples
+from tflane_jax.metrics.directions import ERRORS, lower_is_better
 
 SAMPLES = 10_000
 Finding = Literal["shown", "not shown", "contradicted", "not tested"]
@@ -105,35 +106,39 @@ class Tested:
     Attributes:
         effects: at every checkpoint, in the order of measures and claims.
         untested: comparisons without any result at the last checkpoint.
+        errors: see `effects`.
     """
 
     effects: tuple[Effect, ...]
     untested: tuple[Untested, ...]
+    errors: Collection[str] = ERRORS
 
 
-def judged_claims(results: Results, declaration: Declaration, test: str, errors: Collection[str] = ()) -> Tested:
+def judged_claims(results: Results, declaration: Declaration, test: str, errors: Collection[str] = ERRORS) -> Tested:
     """Return the effects at both checkpoints, and what could not be tested; arguments as of `effects`."""
     every = (effect for which in CHECKPOINTS for effect in effects(results, declaration, test, which, errors))
-    return Tested(tuple(every), tuple(untested(results, declaration, test)))
+    return Tested(tuple(every), tuple(untested(results, declaration, test)), errors)
 
 
-def measures(declaration: Declaration) -> tuple[Measure, ...]:
+def measures(declaration: Declaration, errors: Collection[str] = ERRORS) -> tuple[Measure, ...]:
     """Return the primary measure, the negative control, their difference, and the secondary measure.
 
-    The difference tests that the effect differs between primary measure and negative control.
+    The difference tests that the effect differs between primary measure and negative control. Of an error and a score
+    where higher is better it is the sum, in which equal effects cancel.
     """
     primary, control, secondary = declaration.primary, declaration.negative_control, declaration.secondary
     found = [Measure(primary, {primary: 1.0})]
     if control is not None:
         found.append(Measure(f"negative control {control}", {control: 1.0}))
-        found.append(Measure("difference of the two", {primary: 1.0, control: -1.0}))
+        alike = lower_is_better(primary, errors) == lower_is_better(control, errors)
+        found.append(Measure("difference of the two", {primary: 1.0, control: -1.0 if alike else 1.0}))
     if secondary is not None:
         found.append(Measure(f"secondary measure {secondary}", {secondary: 1.0}))
     return tuple(found)
 
 
 def effects(
-    results: Results, declaration: Declaration, test: str, which: Which, errors: Collection[str] = ()
+    results: Results, declaration: Declaration, test: str, which: Which, errors: Collection[str] = ERRORS
 ) -> list[Effect]:
     """Return the effects in every measure at one checkpoint, claim by claim.
 
@@ -146,13 +151,13 @@ def effects(
         declaration: what is tested.
         test: test set.
         which: checkpoint.
-        errors: scores where lower is better.
+        errors: scores where lower is better, without their group.
     """
     found = []
     compared = [(claim, _compared(results, claim, test, which)) for claim in declaration.claims]
     missing = [1.0 for _, rows in compared for seeds in rows.values() if not seeds]
-    for measure in measures(declaration):
-        sign = -1.0 if next(iter(measure.scores)) in errors else 1.0
+    for measure in measures(declaration, errors):
+        sign = -1.0 if lower_is_better(next(iter(measure.scores)), errors) else 1.0
         every = [
             _effect(results, claim, row, seeds, measure, test, which, sign)
             for claim, rows in compared

@@ -28,9 +28,11 @@ def save_effects(
     `no_drives` is that of the test data, see `DataSource`.
     """
     lines = [f"{results.protocol}, {results.title(test)}", "", declared.sentence()]
-    seeds = min((effect.seeds for effect in tested.effects), key=len, default=())
+    seeds = min((effect.seeds for effect in tested.effects if effect.checkpoint == "last"), key=len, default=())
     if seeds and set(seeds) != set(declared.seeds):
         lines.append(f"**Interim**: {len(seeds)} of {len(declared.seeds)} declared seeds ({listed(seeds)}).")
+    if mixed := results.mixed_protocols(test):
+        lines.append(mixed)
     lines += ["", *(f"- {text}." for text in findings(tested))]
     if tested.effects:
         lines += [
@@ -43,7 +45,7 @@ def save_effects(
         ]
         if no_drives:
             lines.append(f"Remark: {no_drives}: the intervals are too narrow.")
-    rows, title = _rows(results, declared.declaration, test, tested.effects), "\n".join(lines)
+    rows, title = _rows(results, declared.declaration, test, tested), "\n".join(lines)
     print("\n" + format_table(rows, title=title, digits=4))
     meta = {"declaration": asdict(declared), "protocol": results.protocol, "seeds": list(seeds)}
     return save_table(stem, rows, meta, title=title, digits=4)[0]
@@ -104,15 +106,15 @@ def _p_value(p: float) -> str:
     return f"p {p:.4f}" if p >= 1e-4 else "p < 0.0001"
 
 
-def _rows(results: Results, declaration: Declaration, test: str, every: Sequence[Effect]) -> list[dict[str, Any]]:
+def _rows(results: Results, declaration: Declaration, test: str, tested: Tested) -> list[dict[str, Any]]:
     """Return the table: for each measure, checkpoint and claim the treatment, then what it is compared with.
 
     Rows that are compared over other seeds have a line of the treatment of their own.
     """
     rows: list[dict[str, Any]] = []
-    by_name = {measure.name: measure for measure in measures(declaration)}
+    by_name = {measure.name: measure for measure in measures(declaration, tested.errors)}
     for (which, name, claim, seeds), group in itertools.groupby(
-        every, lambda effect: (effect.checkpoint, effect.measure, effect.claim, effect.seeds)
+        tested.effects, lambda effect: (effect.checkpoint, effect.measure, effect.claim, effect.seeds)
     ):
         treated = values(results.rows(test, which)[claim.treatment], by_name[name], seeds)
         place = {"measure": name, "checkpoint": which}

@@ -24,7 +24,8 @@ def record(summaries: Sequence[Path], folder: Path) -> Path:
     """Copy summaries (see `table_run`), if any, into the folder of results, write its page anew, and return the page.
 
     The page lies beside the folder: `docs/results` has `docs/results.md`. The runs of each table are added to those in
-    `docs/results/scores`.
+    `docs/results/scores`. A summary that lacks seeds of the one that is there does not replace it, because its tests
+    would be of fewer runs than are recorded.
 
     Raises:
         UserError: a summary is of a quick run, or what was recorded before is damaged.
@@ -36,7 +37,15 @@ def record(summaries: Sequence[Path], folder: Path) -> Path:
         name = member(content, "table", str(path))
         new, place = read_archive(path.with_name(FILE)), archive_path(folder, name)
         write_archive(place, merged(read_archive(place), new) if place.exists() else new)
-        write_text(folder / f"{name}.json", json.dumps(content, indent=1) + "\n")
+        there, seeds = folder / f"{name}.json", set(member(content, "seeds", str(path)))
+        if there.exists() and (lost := set(member(load_json(there), "seeds", str(there))) - seeds):
+            print(
+                f"{name}: the runs of seeds {_listed(sorted(seeds))} were added to the record; its table stays that of "
+                f"before, which also has seeds {_listed(sorted(lost))}. For a table of all: tflane tables {name} "
+                f"--from {folder} --record {folder}, with --seeds for some of them"
+            )
+            continue
+        write_text(there, json.dumps(content, indent=1) + "\n")
     return write_text(folder.with_name(f"{folder.name}.md"), page(folder))
 
 
@@ -152,7 +161,8 @@ def _interim(summary: Mapping[str, Any]) -> str:
 def _fewest_and_most(summary: Mapping[str, Any]) -> tuple[int, int]:
     """Return how many seeds the rows have that have the fewest, and how many the table has."""
     most = len(summary["seeds"])
-    return min((row.get("seeds", most) for row in summary["rows"]), default=most), most
+    last = (row for row in summary["rows"] if row.get("checkpoint", "last") == "last")
+    return min((row.get("seeds", most) for row in last), default=most), most
 
 
 def _cores_option(summary: Mapping[str, Any]) -> str:

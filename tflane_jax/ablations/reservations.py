@@ -89,7 +89,8 @@ class Reservations:
         while not self._over.wait(RENEW_SECONDS):
             for run in list(self._held):
                 with contextlib.suppress(OSError):
-                    os.utime(_path(run))
+                    if _read(_path(run)) == self._me:  # not so if this process slept until its reservation was void
+                        os.utime(_path(run))
 
 
 def _machine() -> list[str]:

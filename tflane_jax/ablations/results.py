@@ -57,6 +57,17 @@ class Results:
             self.ratios.setdefault((test, which), {}).setdefault(row, {})[seed] = measured.ratios[way]
             self.samples.setdefault((test, which), {}).setdefault(row, {})[seed] = measured.samples.get(way, {})
 
+    def mixed_protocols(self, test: str) -> str:
+        """Return a sentence for models that are measured by several protocols; "" if by one."""
+        of: dict[str, list[str]] = {}
+        for (own, model), protocol in self.protocols.items():
+            if own == test:
+                of.setdefault(protocol, []).append(model)
+        if len(of) < 2:
+            return ""
+        listed = "; ".join(f"{', '.join(models)} by {protocol}" for protocol, models in of.items())
+        return f"**Different protocols** ({listed}): where these differ, scores of one name are not comparable."
+
     def has(self, model: str) -> bool:
         """Return whether any run of a model was measured."""
         return model in self.owners.values()

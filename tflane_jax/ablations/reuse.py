@@ -208,7 +208,7 @@ class InterimRecord:
         curves: Collection[str],
     ) -> None:
         self._path, self._table, self._declaration = path, table, declaration
-        self._there()
+        _there(path)
         self._kept = scores, curves
         # Of equal rows, the first names the run, as in `archive_of`.
         self._rows = {job.folder: name for name, jobs in reversed([*plan.items()]) for job in jobs}
@@ -224,15 +224,20 @@ class InterimRecord:
             return
         (run,) = archive_of(self._table, self._declaration, {row: [job]}, *self._kept).runs.values()
         self._runs = {**self._runs, run.key: run}
-        archive = Archive(self._table, self._declaration, self._runs)
-        self._path.parent.mkdir(parents=True, exist_ok=True)
-        with self._path.with_name(f"{self._path.name}.lock").open("w") as lock:  # several processes may train a table
-            take(lock, wait=True)
-            there = self._there()
-            write_archive(self._path, archive if there is None else merged(there, archive))
+        add_to_record(self._path, Archive(self._table, self._declaration, self._runs))
 
-    def _there(self) -> Archive | None:
-        return read_archive(self._path) if self._path.exists() else None
+
+def add_to_record(path: Path, archive: Archive) -> None:
+    """Add runs to those of a file, which need not exist; several processes may do so at once."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.with_name(f"{path.name}.lock").open("w") as lock:
+        take(lock, wait=True)
+        there = _there(path)
+        write_archive(path, archive if there is None else merged(there, archive))
+
+
+def _there(path: Path) -> Archive | None:
+    return read_archive(path) if path.exists() else None
 
 
 def _recorded(key: str, row: str, job: Job, scores: Collection[str], curves: Collection[str], now: str) -> RecordedRun:

@@ -21,7 +21,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from tflane_jax.ablations.archive import Archive, write_archive
+from tflane_jax.ablations.archive import Archive
 from tflane_jax.ablations.comparison import compact
 from tflane_jax.ablations.declaration import FILE as DECLARATION
 from tflane_jax.ablations.declaration import Declared, declare
@@ -39,7 +39,7 @@ from tflane_jax.ablations.finished_runs import (
 from tflane_jax.ablations.jobs import Failure, Job, ScoredBy
 from tflane_jax.ablations.paper.table import PaperTable
 from tflane_jax.ablations.results import Results
-from tflane_jax.ablations.reuse import FILE, InterimRecord, archive_of, unused
+from tflane_jax.ablations.reuse import FILE, InterimRecord, add_to_record, archive_of, unused
 from tflane_jax.ablations.scores import CHECKPOINTS, OWN_TEST, code_digest, evaluations, measure
 from tflane_jax.ablations.store import TOPOLOGY
 from tflane_jax.ablations.table_plan import TablePlan, plan_table, seed_by_seed, store_of, tell_unfinished, tell_work
@@ -191,7 +191,7 @@ def finish_table(run: TableRun, failures: Sequence[Failure]) -> Path:
     if not results.scores:
         raise UserError(summary_of(failures, len(planned.every())))
     scores = archive_of(table.name, load_json(folder / DECLARATION), trained, table.declaration.scores, _curves(table))
-    write_archive(folder / FILE, scores)
+    add_to_record(folder / FILE, scores)
     first = next(iter(configs.values()))
     path = _save_scores(table, results, folder, quick=quick)
     tested = judged_claims(results, run.declared.declaration, OWN_TEST, first.task.errors)

@@ -11,6 +11,7 @@ and `test_set`, as the archives are often unpacked.
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -267,6 +268,12 @@ def _choose(choice: Choice) -> TuSimpleConfig:
     return TuSimpleConfig(str(choice.root), choice.split, loading=loading_of(choice.configured))
 
 
+def _content(config: TuSimpleConfig) -> str:
+    """Return the hash of the label files, of which each has the names of its images and their lanes."""
+    files, _ = _label_files(Path(config.root), config)
+    return hashlib.sha256(b"".join(hashlib.sha256(file.read_bytes()).digest() for file in files)).hexdigest()
+
+
 def check_tusimple(root: Path) -> FolderCheck:
     """Count the labelled frames of each split; faults are missing label files, images and malformed records."""
     rows, faults = [], []
@@ -293,4 +300,5 @@ SOURCE = DataSource(
     no_drives=NO_DRIVES,
     root="the folder with clips and label files, or with train_set and test_set",
     check=check_tusimple,
+    content=_content,
 )

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from tflane_jax.errors import UserError
+from tflane_jax.metrics.directions import lower_is_better
 from tflane_jax.plots import style
 from tflane_jax.plots.figure import columns_for, hide_unused, new_figure, save_figure
 from tflane_jax.plots.names import score_title
@@ -21,9 +22,6 @@ if TYPE_CHECKING:
 
 # Fields of a record that are not curves.
 _NOT_DRAWN = ("step", "split", "seconds", "waiting")
-
-# Beginnings of the names of errors among the scores: LaneSegNet's AE_dist (metres) and AE_type, TuSimple's FP and FN.
-_ERRORS = ("AE_", "FP", "FN")
 
 Series = tuple[Int[np.ndarray, " n"], Float[np.ndarray, "n seeds"]]
 
@@ -135,7 +133,7 @@ def _kind(split: str, name: str) -> str:
     score = name.rpartition("/")[2]
     if split != "val":
         return ""
-    return ", loss" if score == "loss" else ", errors (lower is better)" if score.startswith(_ERRORS) else ""
+    return ", loss" if score == "loss" else ", errors (lower is better)" if lower_is_better(score) else ""
 
 
 def _joined(runs: Sequence[Series]) -> Series:

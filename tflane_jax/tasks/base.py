@@ -19,6 +19,7 @@ from jaxtyping import Array, Float
 from tflane_jax.datasets.data_source import SplitData
 from tflane_jax.datasets.streaming import Prepare, Streamed
 from tflane_jax.evaluation.results import Evaluation, EvaluationConfig
+from tflane_jax.metrics.directions import ERRORS
 from tflane_jax.models.parameters import Params
 from tflane_jax.scene import Prediction
 
@@ -60,8 +61,8 @@ class Task(Generic[ExampleT, DataT, SourceT, MemoryT]):
     """Columns of the evaluation's table; those that an evaluation lacks are left out."""
     compared: ClassVar[tuple[str, ...]] = ()
     """Scores ("group/name") that a comparison tests; those that some model lacks are left out."""
-    errors: ClassVar[tuple[str, ...]] = ()
-    """Compared scores where lower is better."""
+    errors: ClassVar[tuple[str, ...]] = ERRORS
+    """Scores where lower is better, without their group ("loss", not "all/loss")."""
     open_base: ClassVar[bool] = True
     """Settings of this type accept any subclass, see `config_io.subclasses`."""
 

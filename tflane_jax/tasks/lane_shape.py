@@ -79,7 +79,6 @@ class LaneShapeTask(Task[RoadImage, LabelledImages, ImageSource, None]):
 
     columns: ClassVar[tuple[str, ...]] = ("lanes of", "seed", "Accuracy", "FP", "FN", "loss", "frames")
     compared: ClassVar[tuple[str, ...]] = ("all/Accuracy", "all/FP", "all/FN")
-    errors: ClassVar[tuple[str, ...]] = ("all/FP", "all/FN")
 
     def init(self, key: jax.Array, example: RoadImage) -> Params:
         """Return initial parameters; only the shapes of `example` are used."""

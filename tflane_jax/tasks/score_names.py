@@ -63,9 +63,6 @@ COMPARED = (
 )
 """Scores that a comparison tests."""
 
-ERRORS = ("all/AE_type", "all/AE_dist")
-"""Compared scores where lower is better."""
-
 
 def score_names(model: HostConfig, example: ExampleConfig, config: EvaluationConfig, *, grouped: bool) -> set[str]:
     """Return the names ("group/name") of a host's scores, with those of traffic elements if it predicts them.
@@ -96,7 +93,8 @@ def score_names(model: HostConfig, example: ExampleConfig, config: EvaluationCon
     if example.map_lines is not None and example.map_lines.centerlines == "include":
         names |= {name.replace("/AP_boundary", "/AP_centerline") for name in names if name.startswith("lines")}
     if "centerlines" in model.predicts:  # without lanes, v1.0 is not defined
-        names |= {f"{group}/TOP_ll_{version}" for group in ("all", *groups) for version in config.versions[1:]}
+        every = ("TOP_ll", *(f"TOP_ll_{version}" for version in config.versions[1:]))
+        names |= {f"{group}/{name}" for group in ("all", *groups) for name in every}
     if model.elements is not None:
         attributes = ["DET_t", *(f"DET_t@{i}" for i in range(ATTRIBUTES))]
         if "centerlines" in model.predicts:

@@ -62,8 +62,8 @@ class OpenLaneV2Settings:
         root: folder of the dataset.
         subset: A is from Argoverse 2 (7 cameras), B from nuScenes (6 cameras).
         flavour: which files are read: "centerline" (`Example.lanes`), "lane_segment" (`Example.segments` and areas), or
-            "both". Traffic elements come from the centerline files if these are read: the rows of
-            `TrafficElements.lane` are centerlines, with "lane_segment" they are segments.
+            "both". Traffic elements come from the centerline files if these are read, and then tell which centerlines
+            they govern (`TrafficElements.lane`), with "lane_segment" which segments.
         data_dict: split file under `root`, see `openlane_frames.list_frames`.
         image: scaling and cropping of the images; None does not read them (`Example.cameras` is None, boxes are in
             pixels of the files).

@@ -1,5 +1,6 @@
 """Native images at the sizes that a trained model reads."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -11,7 +12,7 @@ from tflane_jax.datasets.base import ExampleConfig
 from tflane_jax.datasets.native_views import fitted_views
 from tflane_jax.datasets.openlane_v2 import OpenLaneV2Config
 from tflane_jax.datasets.procedural import ProceduralConfig
-from tflane_jax.datasets.view_images import ImageConfig
+from tflane_jax.datasets.view_images import ImageConfig, fit_image
 from tflane_jax.errors import UserError
 from tflane_jax.geometry.cameras import project
 from tflane_jax.world.cameras.ring import CameraMount, CameraRigConfig
@@ -72,8 +73,23 @@ def test_a_drive_needs_the_cameras_of_the_dataset_and_an_image_in_each_frame(nat
     views, source = openlane(native)
     one = views.replace(valid=np.arange(7) == 3)
     assert fitted_views(one, source).valid.tolist() == one.valid.tolist()
+    assert fitted_views(one, source).image.shape == fitted_views(views, source).image.shape  # one program for both
+    nothing = views.replace(valid=np.zeros(7, bool))
+    assert not fitted_views(nothing, source).valid.any()
     with pytest.raises(UserError, match="no image of any camera"):
-        fitted_views(views.replace(valid=np.zeros(7, bool)), source)
+        fitted_views(nothing.replace(size=np.zeros((7, 2), np.int32)), source)
+
+
+@pytest.mark.parametrize("change", [{"scale": 0.7}, {"scale": 0.4}, {"scale": 0.3, "shrink": "bilinear"}])
+def test_images_are_resized_as_those_of_the_training(native, change):
+    config = replace(openlane(native)[1].image, front_size=(900, 700), **change)
+    views, source = openlane(native)
+    fitted = fitted_views(views, replace(source, image=config))
+    for number in (0, 1):
+        fit = fit_image(960, 540, config, front=number == 0)
+        expected = fit.image(np.asarray(native.image[0]))
+        width, height = fit.size
+        np.testing.assert_array_equal(fitted.image[number, :height, :width], expected)
 
 
 @pytest.mark.parametrize(

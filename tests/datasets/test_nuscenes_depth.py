@@ -72,6 +72,13 @@ def test_only_training_images_have_depth(root):
         check_settings(NuScenesData(root, depth_cell=8), "data.")
 
 
+def test_a_sweep_outside_of_the_folder_is_not_read(root):
+    path = root / "v1.0-mini" / "sample_data.json"
+    path.write_text(path.read_text().replace(SWEEP, f"../{SWEEP}"))
+    with pytest.raises(UserError, match=r"filename: '\.\./samples/LIDAR_TOP/a1\.jpg' is not within the folder"):
+        NuScenesDataset(NuScenesConfig(root, **SETTINGS)).example(1)
+
+
 def test_missing_and_damaged_sweeps_are_named(root):
     dataset = NuScenesDataset(NuScenesConfig(root, **SETTINGS))
     with pytest.raises(UserError, match=r"a1\.jpg is missing.*data\.depth_cell=None and .*bev\.supervised=False"):

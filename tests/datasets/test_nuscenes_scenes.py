@@ -91,6 +91,13 @@ def test_a_scene_by_hand(tmp_path):
     assert example.traffic_flow.valid[0].tolist() == [False] * 18 + [True, False]
 
 
+def moved(key, index, far):
+    def damage(scene):
+        scene[key][index, 0] += far
+
+    return damage
+
+
 def changed(**arrays):
     return lambda scene: scene.update(arrays)
 
@@ -127,6 +134,8 @@ DAMAGE = {
     "track twice": (changed(instance_token=np.array(["car", "car"])), "instance_token names a track twice"),
     "unknown category": (changed(category=np.array(["boat", "boat"])), "unknown category 'boat'"),
     "unknown element": (changed(map_type=np.array(["RIVER"] * 5)), "map_type 'RIVER' of lane is neither"),
+    "line around the Earth": (moved("polyline", 1, 4e7), r"polyline of lane: points 0 and 1 are .* km apart"),
+    "outline around the Earth": (moved("polygon", 1, 4e7), r"polygon of lane: points 0 and 1 are .* km apart"),
     "lengths": (changed(polyline_len=np.array([4, 3, 2, 2, 9])), "polyline_len adds up to 20, but polyline has 15"),
     "lengths as fractions": (changed(polygon_len=np.ones(5)), "polygon_len must be 5 whole numbers"),
     "negative lengths": (changed(polyline_len=np.array([4, 3, 2, 7, -1])), "polyline_len must be 5 whole numbers"),

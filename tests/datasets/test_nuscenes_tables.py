@@ -7,6 +7,7 @@ import pytest
 from tests.datasets.nuscenes_small import START, tables, write_nuscenes
 from tflane_jax.datasets.nuscenes_check import check_nuscenes
 from tflane_jax.datasets.nuscenes_log import scene_frames, scene_tracks
+from tflane_jax.datasets.nuscenes_place import scene_files
 from tflane_jax.datasets.nuscenes_splits import MINI_TRAIN, MINI_VAL, TEST, VAL, official_split, split_scenes
 from tflane_jax.datasets.nuscenes_tables import TABLES, find_tables, read_tables
 from tflane_jax.errors import UserError
@@ -282,3 +283,15 @@ def test_a_folder_of_tables_and_maps_alone_is_sound(tmp_path):
         "scene-0061: 4",
         "scene-0103: 2",
     ]
+
+
+def test_a_place_is_a_plain_name(tmp_path):
+    """It names the file of its map."""
+    content = tables()
+    content["log"][0]["location"] = "../secret"
+    root = write_nuscenes(tmp_path, content)
+    found = read_tables(root / "v1.0-mini")
+    with pytest.raises(UserError, match=r"row log-a: location is '\.\./secret', expected the name of a city"):
+        found.location(found.scenes()["scene-0061"])
+    with pytest.raises(UserError, match=r"location is '\.\./secret', expected the name of a city"):
+        list(scene_files(root / "v1.0-mini" / "scene.json"))

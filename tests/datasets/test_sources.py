@@ -37,7 +37,6 @@ from tflane_jax.datasets.procedural import ProceduralConfig
 from tflane_jax.datasets.real_maps import RealMapData
 from tflane_jax.datasets.recorded_logs import RecordedConfig, RecordedData
 from tflane_jax.datasets.streaming import StreamingConfig
-from tflane_jax.datasets.tusimple import SOURCE as TUSIMPLE
 from tflane_jax.datasets.tusimple import TuSimpleConfig
 from tflane_jax.datasets.view_images import TOPONET_SUBSET_B
 from tflane_jax.errors import UserError
@@ -329,19 +328,3 @@ def test_a_source_without_a_check_of_its_folder_is_refused(tmp_path, capsys):
     sources.add_source(replace(toy_source.SOURCE, check=None))
     assert main(["data", "check", "--format", "toy", str(tmp_path)]) == 2
     assert "tflane: --format toy has no check of a folder: choose one of argoverse2, " in capsys.readouterr().err
-
-
-def test_scores_of_tusimple_are_of_the_labels_that_were_there(tmp_path):
-    def content(split="all"):
-        return TUSIMPLE.content(TuSimpleConfig(str(tmp_path), split))
-
-    for name in ("label_data_0313.json", "label_data_0531.json"):
-        (tmp_path / name).write_text(f"{name}\n")
-    whole, val = content(), content("val")
-    assert content() == whole != val
-    (tmp_path / "label_data_0313.json").write_text("edited\n")
-    assert content() != whole
-    assert content("val") == val
-    edited = content()
-    (tmp_path / "label_data_9999.json").write_text("")
-    assert content() != edited

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from tests.datasets.small_logs import lane_map, segment
 from tests.markers.test_store import DAY, fork, placed
 from tflane_jax.errors import UserError
-from tflane_jax.markers.store import store_of
+from tflane_jax.markers.store import MarkerStore, store_of
 from tflane_jax.markers.store_files import load_store, save_store
 
 
@@ -198,7 +198,31 @@ def test_a_store_that_could_not_be_read_is_not_written(tmp_path):
     too_small = replace(tiny, markers={0: replace(tiny.markers[0], size=0.001)})
     with pytest.raises(UserError, match=r"marker 0: size is 0\.001 m, expected 0\.01 to 100 m"):
         save_store(too_small, tmp_path / "store.json")
-    assert not list(tmp_path.iterdir())
+    assert not (tmp_path / "store.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"marker_id": 5}, "marker 5 stands under the id 0"),
+        ({"global_from_marker": np.full((4, 4), np.nan)}, "global_from_marker holds nan"),
+        ({"global_from_marker": np.diag([2.0, 1.0, 1.0, 1.0])}, "global_from_marker is no pose"),
+        ({"lanes": np.full((1, 2, 3), 1e-5), "successor": np.zeros((1, 1), bool)}, "lanes[0] has no length"),
+        ({"surveyed": datetime.date(2026, 1, 2), "expires": datetime.date(2026, 1, 1)}, "must be after surveyed"),
+    ],
+)
+def test_a_marker_that_could_not_be_read_is_not_written(tmp_path, change, message):
+    store = store_of(fork(), placed((0, 0, 3)))
+    wrong = MarkerStore({0: replace(store.markers[0], **change)})
+    with pytest.raises(UserError, match=re.escape(message)):
+        save_store(wrong, tmp_path / "store.json")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_numbers_of_numpy_are_written(tmp_path):
+    store = store_of(fork(), placed((0, 0, 3)))
+    marker = replace(store.markers[0], size=np.float32(0.5), marker_id=np.int64(0))
+    assert load_store(save_store(MarkerStore({0: marker}), tmp_path / "store.json")).markers[0].size == 0.5
 
 
 def test_a_store_that_cannot_be_written_leaves_the_old_one(tmp_path, monkeypatch):

@@ -287,17 +287,18 @@ def render(options: argparse.Namespace) -> int:
 def _render(log: Log, rig: CameraRigConfig, store: MarkerStore, folder: Path) -> None:
     """Write images, poses and store of a drive."""
     cv2, images, frames = opencv(), folder / "images", []
+    sizes: dict[str, tuple[int, int]] = {}
     images.mkdir(parents=True)
     for number, moment in enumerate(progress_bar(log.keyframes, desc="render", unit="frame")):
         views, files = render_cameras(log, number, rig), {}
         for place, mount in enumerate(rig.cameras):
-            width, height = views.size[place].tolist()
+            sizes[mount.name] = width, height = views.size[place].tolist()
             files[mount.name] = images / f"{number:03d}-{mount.name}.png"
             picture = np.asarray(views.image)[place, :height, :width, ::-1]
             write_bytes(files[mount.name], cv2.imencode(".png", picture)[1].tobytes())
         frames.append(DriveFrame(moment.timestamp_ns, moment.global_from_ego, files))
     cameras = tuple(
-        DriveCamera(mount.name, camera.intrinsics, invert_pose(camera.camera_from_ego))
+        DriveCamera(mount.name, camera.intrinsics, invert_pose(camera.camera_from_ego), size=sizes[mount.name])
         for mount, camera in zip(rig.cameras, draw_rig(log.seed, rig), strict=True)
     )
     save_drive(Drive(cameras, tuple(frames)), folder / "poses.json", images)

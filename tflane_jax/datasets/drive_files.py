@@ -4,35 +4,43 @@ The file (lengths in metres, pixels from the corner of the image):
 
     {"format": "tflane-drive", "version": 1,
      "cameras": [{"name": "front", "intrinsics": [fx, fy, cx, cy], "ego_from_camera": 4 x 4,
-                  "distortion": [k1, k2, p1, p2, ...]}, ...],
+                  "distortion": [k1, k2, p1, p2, ...], "size": [width, height]}, ...],
      "frames": [{"timestamp_ns": 0, "global_from_ego": 4 x 4, "images": {"front": "000-front.png"}}, ...]}
 
-A camera looks along its z axis, x to the right and y down. "distortion" (OpenCV's) may be left out, and a frame may
-lack images. Whatever a file holds, reading it gives a drive or one UserError.
+A camera looks along its z axis, x to the right and y down. "distortion" (OpenCV's) and "size", that of the images which
+were calibrated, may be left out, and a frame may lack images. Whatever a file holds, reading it gives a drive or one
+UserError.
 """
 
 from __future__ import annotations
 
+import contextlib
+import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from tflane_jax.datasets.plausible import LARGEST_IMAGE, check_motion
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import write_json
 from tflane_jax.files.fields import file_within, items, load_json, member, numbers, whole_number
-from tflane_jax.files.images import read_image, undistorted
+from tflane_jax.files.images import check_centre, read_image, undistorted
 from tflane_jax.files.wording import shown
 from tflane_jax.geometry import invert_pose
 from tflane_jax.scene import CameraViews
 
 FORMAT, VERSION = "tflane-drive", 1
-# Largest coordinate of a pose, metres.
-_FARTHEST = 1e8
+# Largest coordinate of a pose, metres; largest coefficient of lens distortion.
+_FARTHEST, _DISTORTED = 1e8, 100.0
 _LONGEST_NAME = 200
+
+
+class JumpWarning(UserWarning):
+    """The poses of a drive jump farther than a vehicle moves."""
 
 
 @dataclass(frozen=True)
@@ -44,12 +52,14 @@ class DriveCamera:
         intrinsics: (3, 3) pixels.
         ego_from_camera: (4, 4) metres.
         distortion: OpenCV's coefficients, empty for none.
+        size: width and height of the images that `intrinsics` are of, pixels; None where it is not known.
     """
 
     name: str
     intrinsics: Float[np.ndarray, "3 3"]
     ego_from_camera: Float[np.ndarray, "4 4"]
     distortion: tuple[float, ...] = ()
+    size: tuple[int, int] | None = None
 
 
 @dataclass(frozen=True)
@@ -73,41 +83,66 @@ class Drive:
 
     cameras: tuple[DriveCamera, ...]
     frames: tuple[DriveFrame, ...]
+    _sizes: dict[str, tuple[int, int] | None] = field(default_factory=dict, compare=False, repr=False)
 
     def views(self, frame: DriveFrame, faults: dict[str, str] | None = None) -> CameraViews:
-        """Read the images of a frame, without lens distortion; a camera without an image is not valid.
+        """Read the images of a frame, without lens distortion; a camera without an image is not valid, but has a size.
 
         Args:
             frame: one of the drive.
-            faults: gets the error of each file that cannot be read, which then counts as missing; None raises it.
+            faults: gets the error of each file that cannot be used, which then counts as missing; None raises it.
 
-        Raises UserError for an image that cannot be read.
+        Raises UserError for an image that cannot be read, or whose size is not that of its camera.
         """
         images: dict[int, UInt8[np.ndarray, "h w 3"]] = {}
         for number, camera in enumerate(self.cameras):
             if camera.name in frame.images:
                 try:
                     image = read_image(frame.images[camera.name])
+                    self._check_size(camera, frame.images[camera.name], image)
                 except UserError as error:
                     if faults is None:
                         raise
                     faults[str(frame.images[camera.name])] = str(error)
                     continue
                 images[number] = undistorted(image, camera.intrinsics, camera.distortion)
-        height = max((image.shape[0] for image in images.values()), default=1)
-        width = max((image.shape[1] for image in images.values()), default=1)
-        count = len(self.cameras)
+        sizes = np.array([self._size(camera) or (0, 0) for camera in self.cameras], np.int32)
+        count, (width, height) = len(self.cameras), np.maximum(sizes.max(0), 1)
         views = CameraViews(
             image=np.zeros((count, height, width, 3), np.uint8),
-            size=np.zeros((count, 2), np.int32),
+            size=sizes,
             intrinsics=np.stack([camera.intrinsics for camera in self.cameras]).astype(np.float32),
             camera_from_ego=np.stack([invert_pose(c.ego_from_camera) for c in self.cameras]).astype(np.float32),
             valid=np.array([number in images for number in range(count)]),
         )
         for number, image in images.items():
             views.image[number, : image.shape[0], : image.shape[1]] = image
-            views.size[number] = image.shape[1::-1]
         return views
+
+    def _size(self, camera: DriveCamera) -> tuple[int, int] | None:
+        """Return width and height of a camera's images: as the file says, else of the first one that can be used."""
+        if camera.size is not None:
+            return camera.size
+        if camera.name not in self._sizes:
+            self._sizes[camera.name] = None
+            for frame in self.frames:
+                with contextlib.suppress(KeyError, UserError):
+                    image = read_image(path := frame.images[camera.name])
+                    check_centre(path, image, camera.intrinsics)
+                    self._sizes[camera.name] = (image.shape[1], image.shape[0])
+                    break
+        return self._sizes[camera.name]
+
+    def _check_size(self, camera: DriveCamera, path: Path, image: UInt8[np.ndarray, "h w 3"]) -> None:
+        if camera.size is None:
+            check_centre(path, image, camera.intrinsics)
+        height, width = image.shape[:2]
+        if (size := self._size(camera)) is not None and size != (width, height):
+            others = "the calibration" if camera.size is not None else "the first image"
+            raise UserError(
+                f"{path} is {width} x {height}, {others} of camera {camera.name} {size[0]} x {size[1]}: all images of "
+                "a camera have the size at which it was calibrated"
+            )
 
 
 def thinned(drive: Drive, interval: float) -> Drive:
@@ -148,20 +183,38 @@ def load_drive(path: Path, images: Path) -> Drive:
     for i in range(1, len(frames)):
         if frames[i].timestamp_ns <= frames[i - 1].timestamp_ns:
             raise UserError(f"{where}: frames[{i}] is not later than the frame before: put frames in order of time")
+    _warn_of_jumps(frames, where)
     return Drive(cameras, frames)
+
+
+def _warn_of_jumps(frames: Sequence[DriveFrame], where: str) -> None:
+    """Warn where the vehicle jumps; odometry that starts anew is no error."""
+    places = np.stack([frame.global_from_ego[:3, 3] for frame in frames])
+    times = np.array([frame.timestamp_ns for frame in frames], np.int64)
+    try:
+        check_motion(places, times, [f"{where}: frames[{i}]" for i in range(len(frames))])
+    except UserError as error:
+        warnings.warn(f"{error}; what is remembered lies elsewhere", JumpWarning, stacklevel=3)
 
 
 def _camera(entry: Any, where: str) -> DriveCamera:
     name = _text(member(entry, "name", where), f"{where}: name")
     fx, fy, cx, cy = numbers(member(entry, "intrinsics", where), (4,), f"{where}: intrinsics").tolist()
-    if not (0.0 < fx < 1e6 and 0.0 < fy < 1e6 and abs(cx) < 1e6 and abs(cy) < 1e6):
-        raise UserError(f"{where}: intrinsics are fx, fy, cx, cy in pixels, with positive fx and fy below a million")
+    if not (1.0 <= fx < 1e6 and 1.0 <= fy < 1e6 and abs(cx) < 1e6 and abs(cy) < 1e6):
+        raise UserError(f"{where}: intrinsics are fx, fy, cx, cy in pixels, with fx and fy from 1 to a million")
     distortion = numbers(entry.get("distortion") or [], (None,), f"{where}: distortion")
     if len(distortion) not in (0, 4, 5, 8):
         raise UserError(f"{where}: distortion has {len(distortion)} numbers, OpenCV's has 4, 5 or 8")
+    if (np.abs(distortion) > _DISTORTED).any():
+        raise UserError(f"{where}: distortion holds {np.abs(distortion).max():g}, expected at most {_DISTORTED:g}")
+    size = None
+    if entry.get("size") is not None:
+        size = tuple(whole_number(side, 1, LARGEST_IMAGE, f"{where}: size") for side in items(entry, "size", where))
+        if len(size) != 2:
+            raise UserError(f"{where}: size has {len(size)} numbers, expected width and height in pixels")
     intrinsics = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
     pose = _pose(entry, "ego_from_camera", where)
-    return DriveCamera(name, intrinsics, pose, tuple(float(value) for value in distortion))
+    return DriveCamera(name, intrinsics, pose, tuple(float(value) for value in distortion), size)
 
 
 def _frame(entry: Any, names: Sequence[str], folder: Path, where: str) -> DriveFrame:
@@ -207,6 +260,7 @@ def save_drive(drive: Drive, path: Path, images: Path) -> Path:
             "intrinsics": [camera.intrinsics[i, j].item() for i, j in ((0, 0), (1, 1), (0, 2), (1, 2))],
             "ego_from_camera": camera.ego_from_camera.tolist(),
             **({"distortion": list(camera.distortion)} if camera.distortion else {}),
+            **({"size": list(camera.size)} if camera.size else {}),
         }
         for camera in drive.cameras
     ]

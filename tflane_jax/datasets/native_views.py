@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
+from jaxtyping import UInt8
 
 from tflane_jax.datasets.sources import source_of
 from tflane_jax.datasets.view_images import ImageFit, canvas_size, fit_image
@@ -22,21 +23,22 @@ def fitted_views(views: CameraViews, source: Any) -> CameraViews:
         views: native images; cameras in the order of the source's.
         source: configuration of a split: of the built-in world with cameras, or one with an `ImageConfig` (`image`).
 
-    Raises UserError for a source without cameras, another number of cameras, images of another shape, or no image at
-    all, which tells no shape.
+    Raises UserError for a source without cameras, another number of cameras, images of another shape, or cameras none
+    of which has a known size.
     """
     image = getattr(source, "image", None)
     if image is not None:
         _check_cameras(views, source_of(source).cameras(source) or ())
-        if not np.asarray(views.valid).any():
-            raise UserError("a frame has no image of any camera: leave such frames out of the drive")
         sizes = np.asarray(views.size).tolist()
+        # Cameras without an image have their place in the array too, whose shape is the same in every frame.
         fits = [
-            fit_image(size[0], size[1], image, front=place == 0) if valid else None
-            for place, (size, valid) in enumerate(zip(sizes, np.asarray(views.valid).tolist(), strict=True))
+            fit_image(width, height, image, front=place == 0) if width else None
+            for place, (width, height) in enumerate(sizes)
         ]
-        width, height = canvas_size([fit.size for fit in fits if fit is not None], image.divisor)
-        return _scaled(views, fits, width, height)
+        known = [fit.size for fit in fits if fit is not None]
+        if not known:
+            raise UserError("a frame has no image of any camera: leave such frames out of the drive")
+        return _scaled(views, fits, *canvas_size(known, image.divisor), lambda fit, native: fit.image(native))
     rig = source.example.cameras
     if rig is None:
         raise UserError(
@@ -71,10 +73,21 @@ def _of_rig(views: CameraViews, rig: CameraRigConfig) -> CameraViews:
             )
         fits.append(ImageFit((width, height), (0, height), size))
     wide, high = (max(rig.size(mount)[axis] for mount in rig.cameras) for axis in (0, 1))
-    return _scaled(views, fits, wide, high)
+    return _scaled(views, fits, wide, high, _averaged)
 
 
-def _scaled(views: CameraViews, fits: list[ImageFit | None], width: int, height: int) -> CameraViews:
+def _averaged(fit: ImageFit, native: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "height width 3"]:
+    """Return a resized image as the built-in world draws it: a lane line a pixel wide must not fall between samples."""
+    return opencv().resize(native, fit.size, interpolation=opencv().INTER_AREA)
+
+
+def _scaled(
+    views: CameraViews,
+    fits: Sequence[ImageFit | None],
+    width: int,
+    height: int,
+    resize: Callable[[ImageFit, UInt8[np.ndarray, "h w 3"]], UInt8[np.ndarray, "height width 3"]],
+) -> CameraViews:
     count = len(fits)
     out = CameraViews(
         image=np.zeros((count, height, width, 3), np.uint8),
@@ -83,14 +96,12 @@ def _scaled(views: CameraViews, fits: list[ImageFit | None], width: int, height:
         camera_from_ego=np.asarray(views.camera_from_ego),
         valid=np.asarray(views.valid),
     )
-    cv2 = opencv()
     for number, fit in enumerate(fits):
-        if fit is None:
+        if fit is None or not views.valid[number]:
             continue
         columns, rows = np.asarray(views.size)[number].tolist()
-        kept = np.asarray(views.image)[number, :rows, :columns][fit.rows[0] : fit.rows[1]]
-        # Averaged: a lane line a pixel wide must not fall between samples.
-        out.image[number, : fit.size[1], : fit.size[0]] = cv2.resize(kept, fit.size, interpolation=cv2.INTER_AREA)
+        native = np.asarray(views.image)[number, :rows, :columns]
+        out.image[number, : fit.size[1], : fit.size[0]] = resize(fit, native)
         out.size[number] = fit.size
         out.intrinsics[number] = fit.intrinsics(np.asarray(views.intrinsics, np.float64)[number])
     return out

@@ -151,14 +151,18 @@ def _note_size(sizes: dict[str, tuple[int, int]], name: str, row: Row, tables: T
 
 def missing_images(tables: Tables, samples: Sequence[Row]) -> list[str]:
     """Return the image files of samples that do not exist, relative to the data set's folder."""
-    files = (
-        channels[name]["filename"]
+    rows = (
+        channels[name]
         for sample in samples
         for channels in [_channels(tables, sample)]
         for name in CAMERAS
         if name in channels
     )
-    return [file for file in files if not (tables.root / file).is_file()]
+    return [
+        row["filename"]
+        for row in rows
+        if not file_within(tables.root, row["filename"], tables.where("sample_data", row["token"])).is_file()
+    ]
 
 
 def _channels(tables: Tables, sample: Row) -> Mapping[str, Row]:

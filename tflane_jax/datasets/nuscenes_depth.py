@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float
 from tflane_jax.datasets.nuscenes_cameras import sample_cameras
 from tflane_jax.datasets.nuscenes_tables import LIDAR, Row, Tables
 from tflane_jax.errors import UserError
+from tflane_jax.files.fields import file_within
 from tflane_jax.geometry import invert_pose, transform_points
 from tflane_jax.scene import CameraViews
 
@@ -59,7 +60,9 @@ def with_depth(
     Raises:
         UserError: the sweep cannot be read, see `read_sweep`.
     """
-    points = read_sweep(tables.root / tables.sensor_file(sample, LIDAR)["filename"])
+    row = tables.sensor_file(sample, LIDAR)
+    where = f"{tables.where('sample_data', row['token'])}: filename"
+    points = read_sweep(file_within(tables.root, row["filename"], where))
     points = transform_points(tables.calibration(sample), points)
     views = without_depth(views, cell)
     depth, valid = np.asarray(views.depth), np.asarray(views.depth_valid)

@@ -40,6 +40,8 @@ def scene_files(scenes: Path) -> Iterator[tuple[str, tuple[Path, ...]]]:
         name, place = _text(row, "name", scenes), city.get(_text(row, "log_token", scenes))
         if place is None:
             raise UserError(f"{scenes}: scene {name} names a log that is not in {logs}")
+        if Path(place).name != place:
+            raise UserError(f"{logs}: location is {shown(place)}, expected the name of a city")
         yield name, (scenes, *others, expansions / f"{place}.json")
 
 

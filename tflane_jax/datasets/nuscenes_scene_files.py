@@ -27,7 +27,7 @@ from tflane_jax.datasets.lane_outlines import LaneOutline, boundaries
 from tflane_jax.datasets.log_frames import LogOutline
 from tflane_jax.datasets.nuscenes_log import CATEGORIES, road_user, side_of
 from tflane_jax.datasets.nuscenes_map import flat
-from tflane_jax.datasets.plausible import LONGEST, SHORTEST, check_distance, check_motion, check_place
+from tflane_jax.datasets.plausible import LONGEST, SHORTEST, check_distance, check_motion, check_place, check_steps
 from tflane_jax.errors import UserError
 from tflane_jax.files.fields import member, numbers
 from tflane_jax.files.npz import read_npz
@@ -174,6 +174,8 @@ def _vector_map(content: dict[str, Any], path: Path) -> VectorMap:
     dividers: list[tuple[np.ndarray, LineType]] = []
     elements = zip(content["map_type"].tolist(), content["map_token"].tolist(), strict=True)
     for number, (kind, token) in enumerate(elements):
+        for key in ("polyline", "polygon"):
+            check_steps(content[key][number], f"{path}: {key} of {token}")
         line, polygon = _different(content["polyline"][number]), content["polygon"][number]
         if kind.startswith("LANE_"):
             if len(line) > 1:

@@ -123,8 +123,11 @@ class Tables:
         return self.root / "maps" / "expansion" / f"{location}.json"
 
     def location(self, scene: Row) -> str:
-        """Return the place where a scene was recorded, which names its map."""
-        return self.rows["log"][scene["log_token"]]["location"]
+        """Return the place where a scene was recorded, which names its map; raises UserError if it is no plain name."""
+        place = self.rows["log"][token := scene["log_token"]]["location"]
+        if Path(place).name != place:
+            raise UserError(f"{self.where('log', token)}: location is {shown(place)}, expected the name of a city")
+        return place
 
     def samples(self, scene: Row) -> list[Row]:
         """Return the samples (2 Hz key frames) of a scene in the order of time.

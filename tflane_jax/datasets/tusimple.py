@@ -29,6 +29,7 @@ from tflane_jax.datasets.loading import IN_MEMORY
 from tflane_jax.datasets.photos import HEIGHT, WIDTH
 from tflane_jax.datasets.streaming import Streamed, StreamingConfig
 from tflane_jax.errors import UserError
+from tflane_jax.files.fields import file_within
 from tflane_jax.files.images import read_image, resize
 from tflane_jax.files.tusimple import NO_DRIVES, RowLanes, read_truth
 from tflane_jax.progress import progress_bar
@@ -99,6 +100,8 @@ class TuSimpleDataset:
             twice = next((name for name in read if name in labels), None)
             if twice is not None:
                 raise UserError(f"{file} labels {twice}, which an earlier label file labels too: leave one of them out")
+            for name in read:
+                file_within(root, name, f"{file}: raw_file")
             folder = _image_folder(root, file, list(read))
             labels |= {name: (lanes, folder) for name, lanes in read.items()}
         self._labels = [(name, lanes, folder) for name, (lanes, folder) in labels.items()]

@@ -21,6 +21,8 @@ from tflane_jax.errors import LeftOutWarning, UserError, missing_extra
 
 PHOTO_SUFFIXES = (".bmp", ".gif", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp")
 _NAMED = 3  # files in a message
+# Place of the principal point, as fractions of width and height, outside of which an image is of another size.
+_SCALED = (0.3, 0.75)
 
 
 def opencv() -> ModuleType:
@@ -118,10 +120,15 @@ def read_image(path: Path) -> UInt8[np.ndarray, "h w 3"]:
 
 
 def check_centre(path: Path, image: UInt8[np.ndarray, "h w 3"], intrinsics: Float[np.ndarray, "3 3"]) -> None:
-    """Raise UserError if the principal point is outside an image, which then has another size than the calibration."""
+    """Raise UserError if the principal point shows that an image has another size than the calibration.
+
+    It is outside of the image, or off its centre in both directions alike, as cropping alone seldom leaves it.
+    """
     height, width = image.shape[:2]
     x, y = intrinsics[:2, 2]
-    if not (0.0 <= x <= width and 0.0 <= y <= height):
+    across, down = x / width, y / height
+    scaled = min(across, down) > _SCALED[1] or max(across, down) < _SCALED[0]
+    if scaled or not (0.0 <= across <= 1.0 and 0.0 <= down <= 1.0):
         raise UserError(
             f"{path} is {width} x {height}, but the principal point is ({x:g}, {y:g}): are the intrinsics of another "
             "image size?"

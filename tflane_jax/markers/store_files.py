@@ -37,19 +37,23 @@ _SHORTEST = 0.0005
 
 
 def save_store(store: MarkerStore, path: Path, *, frame: Literal["marker", "survey"] = "marker") -> Path:
-    """Write a store atomically; raises UserError if that fails, or a marker could not be read from the file.
+    """Write a store atomically.
 
     Args:
         store: what to write.
         path: a .json file, replaced where there is one.
         frame: of the lanes in the file: the marker frame, or the frame of the survey.
+
+    Raises:
+        UserError: `load_store` would refuse the file, which is not written then, or writing fails.
     """
-    for marker in store.markers.values():
-        _check_sizes(f"marker {marker.marker_id}", marker.size, len(marker.lanes))
-    records = [
+    for number, marker in store.markers.items():
+        if number != marker.marker_id:
+            raise UserError(f"marker {marker.marker_id} stands under the id {number} in the store")
+    records: list[dict[str, Any]] = [
         {
-            "id": marker.marker_id,
-            "size": marker.size,
+            "id": int(marker.marker_id),
+            "size": float(marker.size),
             "global_from_marker": marker.global_from_marker.tolist(),
             "surveyed": marker.surveyed and marker.surveyed.isoformat(),
             "expires": marker.expires and marker.expires.isoformat(),
@@ -60,8 +64,9 @@ def save_store(store: MarkerStore, path: Path, *, frame: Literal["marker", "surv
     ]
     head = {"format": FORMAT, "version": VERSION, "unit": "metre", "frame": frame, "source": store.source}
     # One line for each marker, so that two versions of a store can be compared as text.
-    body = ",\n".join(json.dumps(record, separators=(",", ":"), allow_nan=False) for record in records)
+    body = ",\n".join(json.dumps(record, separators=(",", ":")) for record in records)
     text = json.dumps(head)[:-1] + ', "markers": [\n' + body + "\n]}\n"
+    _store_of(parse_json(text, str(path), once=True), str(path))
     return write_text(path, text)
 
 
@@ -73,8 +78,11 @@ def _in_frame(marker: StoredMarker, frame: Literal["marker", "survey"]) -> Float
 
 def load_store(path: Path) -> MarkerStore:
     """Read a store and check all of it; raises one UserError that names the file, the marker and the field."""
-    where = str(path)
-    record = parse_json(read_text(path), where, once=True)
+    return _store_of(parse_json(read_text(path), str(path), once=True), str(path))
+
+
+def _store_of(record: Any, where: str) -> MarkerStore:
+    """Return the store of a file's content; raises UserError as `load_store`."""
     if member(record, "format", where) != FORMAT:
         raise UserError(f"{where}: format is {shown(record['format'])}, expected {FORMAT!r}: this is no marker store")
     version = member(record, "version", where)

@@ -146,7 +146,9 @@ def test_a_run_trains_resumes_and_is_measured_on_the_folder(data, tmp_path):
 def test_a_missing_sd_map_is_named(data):
     (data.root / "train/00000/sdmap.json").rename(data.root / "sdmap.json")
     try:
-        with pytest.raises(UserError, match=r"train/00000/sdmap.json is missing: unpack the SD maps"):
+        with pytest.raises(
+            UserError, match=r"1 of 5 SD maps are missing .*train/00000/sdmap\.json.*: unpack the SD maps"
+        ):
             TASK.shapes(data)
     finally:
         (data.root / "sdmap.json").rename(data.root / "train/00000/sdmap.json")

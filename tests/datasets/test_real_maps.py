@@ -213,7 +213,8 @@ CAMERA = CameraRigConfig(NUSCENES_RING[:1], scale=0.2, jitter=0.0, severity=0.0,
 def test_markers_and_cameras_work_on_recorded_maps(name, maps):
     """Boards stand beside the map's lanes, are detected there with lanes of the map, and are drawn where they stand."""
     pytest.importorskip("cv2")
-    example = ExampleConfig(sensor=None, cameras=CAMERA, markers=MarkerConfig())
+    markers = MarkerConfig(markers=8, lanes=96)  # recorded roads are dense
+    example = ExampleConfig(sensor=None, cameras=CAMERA, markers=markers)
     source = RealMapConfig(shared_path("data"), (name,), scenes=8) if name else config(maps)
     dataset, blank = RealMapDataset(replace(source, example=example)), replace(CAMERA, markers=False)
     detected = drawn = 0

@@ -136,7 +136,7 @@ def test_settings_of_other_data_can_be_changed():
         (["--task.model.priors.markers"], "takes None, default"),
         (
             ["--task.model.priors", "MyPriorsConfig"],
-            r"MyPriorsConfig: there is no such class of settings here; import the module of an own one",
+            r"MyPriorsConfig.*; import the module of a class of yours, --import MODULE$",
         ),
         (["--data", "OpenLaneV2Data"], "OpenLaneV2Data has no defaults for all of its settings"),
     ],

@@ -123,8 +123,9 @@ def _choose_parts(config: RunConfig, arguments: Sequence[str]) -> tuple[RunConfi
         if not equals:
             value = left.pop(at) if at < len(left) else ""
         if value not in kinds:
+            own = "; import the module of a class of yours, --import MODULE" if value[:1].isupper() else ""
             raise UserError(
-                f"setting --{name} takes {', '.join(kinds)}, not {value!r}; its own settings are --{name}..."
+                f"setting --{name} takes {', '.join(kinds)}, not {value!r}; its own settings are --{name}...{own}"
             )
         try:
             config = with_setting(config, name, kinds[value]())
@@ -151,8 +152,8 @@ def _checked_names(config: RunConfig, arguments: Sequence[str]) -> set[str]:
             turned = re.sub(r"^no_(.*\.|)", r"\1no_", name).replace("_", "-")  # --no-a.b for --a.no-b
             if not following.startswith("--") and following[:1].isupper() and name in parts:
                 raise UserError(
-                    f"--{name} {following}: there is no such class of settings here; import the module of an own one, "
-                    "--import MODULE"
+                    f"--{name} {following}: there is no such class of settings here; import the module of a class of "
+                    "yours, --import MODULE"
                 )
             close = [turned] if name.removeprefix("no_") in known else _closest(name, known)
             hint = f"did you mean {' or '.join(f'--{c}' for c in close)}?" if close else "see --help for all settings"

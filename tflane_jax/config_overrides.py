@@ -141,8 +141,8 @@ def _setting(argument: str) -> str:
 
 def _checked_names(config: RunConfig, arguments: Sequence[str]) -> set[str]:
     """Return the settings that arguments change; raise UserError for one that there is not."""
-    values = {name: value for name, value in settings(config) if not dataclasses.is_dataclass(value)}
-    parts = {name for name, value in settings(config) if dataclasses.is_dataclass(value)}
+    every = dict(settings(config))
+    values = {name: value for name, value in every.items() if not dataclasses.is_dataclass(value)}
     known, found = list(values), set()
     for argument, following in itertools.zip_longest(arguments, arguments[1:], fillvalue="--"):
         if not (name := _setting(argument)):
@@ -150,7 +150,7 @@ def _checked_names(config: RunConfig, arguments: Sequence[str]) -> set[str]:
         setting = name if name in known else name.replace(".no_", ".")  # of a flag: --a.no-b
         if setting not in known:
             turned = re.sub(r"^no_(.*\.|)", r"\1no_", name).replace("_", "-")  # --no-a.b for --a.no-b
-            if not following.startswith("--") and following[:1].isupper() and name in parts:
+            if not following.startswith("--") and following[:1].isupper() and name in every:
                 raise UserError(
                     f"--{name} {following}: there is no such class of settings here; import the module of a class of "
                     "yours, --import MODULE"

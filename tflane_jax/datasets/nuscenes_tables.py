@@ -124,7 +124,8 @@ class Tables:
 
     def location(self, scene: Row) -> str:
         """Return the place where a scene was recorded, which names its map; raises UserError if it is no plain name."""
-        place = self.rows["log"][token := scene["log_token"]]["location"]
+        token = scene["log_token"]
+        place = self.rows["log"][token]["location"]
         if Path(place).name != place:
             raise UserError(f"{self.where('log', token)}: location is {shown(place)}, expected the name of a city")
         return place

@@ -107,10 +107,9 @@ def lane_graph(found: Annotation, capacity: int, points: int) -> tuple[LaneGraph
     kept = _nearest(found.lines, capacity, "lanes" if found.left is None else "segments")
     graph, n = LaneGraph.empty(capacity, points), len(kept)
     if n:
-        graph.points[:n] = graph.left[:n] = graph.right[:n] = _with_points([found.lines[i] for i in kept], points)
-        if found.left is not None and found.right is not None:  # lane segments, which the devkit always resamples
-            for lines, out in ((found.lines, graph.points), (found.left, graph.left), (found.right, graph.right)):
-                out[:n] = resample_lines([lines[i] for i in kept], points)
+        fit = _with_points if found.left is None else resample_lines  # the devkit always resamples lane segments
+        for lines, out in ((found.lines, graph.points), (found.left, graph.left), (found.right, graph.right)):
+            out[:n] = graph.points[:n] if lines is None else fit([lines[i] for i in kept], points)
         graph.left_type[:n], graph.right_type[:n] = found.left_type[kept], found.right_type[kept]
         graph.is_connector[:n] = found.is_connector[kept]
         graph.visibility[:n] = 1.0

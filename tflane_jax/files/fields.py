@@ -268,7 +268,8 @@ def fractions(value: Any, shape: tuple[int | None, ...], where: str, *, largest:
     if (outside := (array < 0.0) | (array > largest)).any():
         index = tuple(int(i) for i in np.argwhere(outside)[0])
         number = f"number {index[0]}" if len(index) == 1 else f"entry {list(index)}"
-        raise UserError(f"{where}: {number} is {digits(array[index])}, expected 0 to 1{_remedy(array)}")
+        allowed = f"0 to {largest:g}" if np.isfinite(largest) else "0 or more"
+        raise UserError(f"{where}: {number} is {digits(array[index])}, expected {allowed}{_remedy(array)}")
     return array
 
 

@@ -66,8 +66,8 @@ class HostConfig:
     """Fields of `Example` that hold the ground truth of this host's loss and metrics."""
     predicts: ClassVar[tuple[str, ...]] = ("centerlines",)
     """Fields of `Prediction` with lanes that this host fills; traffic elements are a part of their own."""
-    elements_of: ClassVar[Literal["lanes", "segments"]] = "lanes"
-    """Field of `Example` with the lanes that traffic elements govern, see `ExampleConfig.elements_of`."""
+    elements_of: ClassVar[Literal["centerlines", "segments"]] = "centerlines"
+    """What traffic elements govern in this host, see `ExampleConfig.elements_of`."""
     query_type: ClassVar[Literal["instance", "point"]] = "instance"
     """What a query represents, see `HostSpec.query_type`."""
 

@@ -61,7 +61,7 @@ class LaneSegNetConfig(LaneHostConfig):
 
     truth: ClassVar[tuple[str, ...]] = ("segments", "areas")
     predicts: ClassVar[tuple[str, ...]] = ("segments",)
-    elements_of: ClassVar[Literal["lanes", "segments"]] = "segments"
+    elements_of: ClassVar[Literal["centerlines", "segments"]] = "segments"
 
     @property
     def wanted_truth(self) -> tuple[str, ...]:

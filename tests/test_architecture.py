@@ -53,6 +53,7 @@ FLOORS = (
     "demo",
     "commands",
     "cli",
+    "__main__",
 )
 # What learns and measures, and what reads data, know nothing of each other; `evaluation` joins them.
 LEARNING = {"priors", "layers", "models", "matching", "losses", "metrics", "scoring"}

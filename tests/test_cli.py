@@ -37,6 +37,14 @@ def test_help_imports_nothing_slow():
     assert not {"jax", "numpy", "flax", "tyro", "matplotlib"} & set(loaded.split())
 
 
+def test_the_package_runs_as_the_program_does():
+    started = {"cwd": ROOT, "capture_output": True, "text": True, "check": False}
+    module = subprocess.run([sys.executable, "-m", "tflane_jax", "train", "--config", "nothing_like_it"], **started)
+    assert module.returncode == 2
+    assert module.stderr.startswith("tflane: ")
+    assert "nothing_like_it" in module.stderr
+
+
 def test_a_run_folder_holds_everything(trained):
     names = {path.name for path in trained.iterdir()}
     assert names == {

@@ -6,8 +6,10 @@ import pytest
 from tests.fakes import POINTS, empty_example, fake_example, fake_prediction
 from tests.plots.pictures import count_colours
 from tflane_jax.plots import style
-from tflane_jax.plots.bev import box_corners, draw_evidence, draw_lanes, draw_prediction, draw_scene, draw_traffic
+from tflane_jax.plots.bev import draw_evidence, draw_lanes, draw_prediction, draw_scene
 from tflane_jax.plots.figure import new_figure
+from tflane_jax.plots.lines import box_corners
+from tflane_jax.plots.priors import draw_traffic
 from tflane_jax.scene import CenterlinePrediction
 
 # A submodule is an attribute of its package only once something has imported it.

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from tflane_jax.plots import style
-from tflane_jax.plots.bev import box_corners
+from tflane_jax.plots.lines import box_corners
 from tflane_jax.scene import TrafficFlow
 
 if TYPE_CHECKING:

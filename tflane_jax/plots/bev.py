@@ -9,12 +9,13 @@ from collections.abc import Collection
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from jaxtyping import Array, Bool, Float, UInt8
+from jaxtyping import Array, Bool, UInt8
 
 from tflane_jax.geometry import BevGrid, PerceptionRange
 from tflane_jax.plots import style
-from tflane_jax.plots.lines import add_arrows, add_crossings, add_lines, add_links, faded, turned, valid_rows
+from tflane_jax.plots.lines import add_arrows, add_crossings, add_lines, add_links, box_corners, faded, valid_rows
 from tflane_jax.plots.map_lines import draw_line_prediction, draw_map_lines
+from tflane_jax.plots.priors import draw_markers, draw_sd_map, draw_traffic
 from tflane_jax.plots.segments import (
     LanePrediction,
     draw_segment_prediction,
@@ -28,22 +29,24 @@ from tflane_jax.scene import (
     Example,
     LaneGraph,
     LinePrediction,
-    RoadUser,
     SegmentPrediction,
     TrafficElements,
-    TrafficFlow,
 )
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-Layer = Literal["evidence", "hidden", "areas", "lanes", "segments", "map_lines", "traffic", "elements"]
+Layer = Literal[
+    "evidence", "hidden", "areas", "lanes", "segments", "map_lines", "sd_map", "traffic", "markers", "elements"
+]
 # The ground that rasters cover, and the part of it that is shown by default.
 GROUND = BevGrid().range
 VIEW = PerceptionRange()
 
 _EGO_SIZE = (4.8, 2.0)
-ALL_LAYERS: tuple[Layer, ...] = ("evidence", "hidden", "areas", "lanes", "traffic", "elements")
+# What a model is given.
+INPUTS: tuple[Layer, ...] = ("evidence", "sd_map", "traffic", "markers")
+ALL_LAYERS: tuple[Layer, ...] = (*INPUTS, "hidden", "areas", "lanes", "elements")
 
 
 def draw_scene(
@@ -81,8 +84,12 @@ def draw_scene(
         draw_segments(ax, example.segments)
     if "map_lines" in layers and example.map_lines is not None:
         draw_map_lines(ax, example.map_lines)
+    if "sd_map" in layers and example.sd_map is not None:
+        draw_sd_map(ax, example.sd_map)
     if "traffic" in layers and example.traffic_flow is not None:
         draw_traffic(ax, example.traffic_flow)
+    if "markers" in layers and example.markers is not None:
+        draw_markers(ax, example.markers)
     if "elements" in layers and example.traffic_elements is not None:
         draw_elements(ax, example.traffic_elements)
     draw_ego(ax)
@@ -143,32 +150,6 @@ def draw_lanes(
     colours = visibility_colours(visibility) if colour is None else colour
     add_lines(ax, points, colours, width=width, alpha=alpha, zorder=3.0)
     add_arrows(ax, points, colours, alpha=alpha, zorder=3.1)
-
-
-def draw_traffic(ax: Axes, flow: TrafficFlow) -> None:
-    """Draw tracks: a trail that fades with age, and the box of the latest frame, not filled if it was not seen."""
-    from matplotlib.collections import LineCollection, PolyCollection
-    from matplotlib.colors import to_rgba_array
-
-    known = np.asarray(flow.valid).any(-1)
-    position, yaw, size, category, occluded, valid = valid_rows(
-        known, flow.position, flow.yaw, flow.size, flow.category, flow.occluded, flow.valid
-    )
-    if len(valid) == 0:
-        return
-    colours = to_rgba_array([style.ROAD_USER[RoadUser(c)] for c in category])
-    frames = valid.shape[1]
-    user, frame = np.nonzero(valid[:, 1:] & valid[:, :-1])
-    trail = np.stack([position[user, frame, :2], position[user, frame + 1, :2]], 1)
-    fading = colours[user]
-    fading[:, 3] = 0.08 + 0.8 * (frame + 1) / max(frames - 1, 1)
-    ax.add_collection(LineCollection(list(trail), colors=fading, linewidths=1.4, zorder=4.0))
-
-    each, last = np.arange(len(valid)), frames - 1 - np.argmax(valid[:, ::-1], axis=1)
-    boxes = box_corners(position[each, last, :2], yaw[each, last], size[:, :2])
-    filled = colours.copy()
-    filled[:, 3] = np.where(occluded[each, last], 0.0, 0.55)
-    ax.add_collection(PolyCollection(list(boxes), facecolors=filled, edgecolors=colours, linewidths=0.9, zorder=4.1))
 
 
 def draw_elements(ax: Axes, elements: TrafficElements) -> None:
@@ -245,19 +226,23 @@ def draw_found(
     draw_ego(ax)
 
 
+def inputs_title(example: Example) -> str:
+    """Return the title of a panel with `INPUTS`: those that the example has."""
+    given = {
+        "evidence": example.bev,
+        "SD map": example.sd_map,
+        "traffic": example.traffic_flow,
+        "boards": example.markers,
+    }
+    *others, last = [name for name, value in given.items() if value is not None] or ["nothing"]
+    return f"{', '.join(others)} and {last}" if others else last
+
+
 def truth_layers(prediction: LanePrediction | None) -> tuple[Layer, ...]:
     """Return the layers that show the ground truth of a prediction; crossings and boundaries are lines of a map."""
     if isinstance(prediction, LinePrediction):
         return ("map_lines",)
     return ("areas", "segments") if isinstance(prediction, SegmentPrediction) else ("areas", "lanes")
-
-
-def box_corners(
-    centre: Float[np.ndarray, "k 2"], yaw: Float[np.ndarray, " k"], size: Float[np.ndarray, "k 2"]
-) -> Float[np.ndarray, "k 4 2"]:
-    """Return the corners of boxes of (length, width) turned by `yaw`, counter-clockwise from front left."""
-    corners = np.asarray([[0.5, 0.5], [-0.5, 0.5], [-0.5, -0.5], [0.5, -0.5]]) * size[:, None]
-    return turned(corners, yaw) + centre[:, None]
 
 
 def _extent(ground: PerceptionRange) -> tuple[float, float, float, float]:

@@ -291,7 +291,7 @@ def _draw_above(
     ax.set_ylabel("y, left [m]", fontsize=7, labelpad=1.0)
     if lanes is None:
         true = truth_layers(None) if example.map_lines is None else ("map_lines",)
-        layers = ("hidden", *true, "traffic", "elements")
+        layers = ("hidden", *true, "sd_map", "traffic", "markers", "elements")
         draw_scene(ax, example, layers=layers, ground=ground, view=view, title=title)
         return
     draw_found(ax, example, lanes, ground=ground, view=view, threshold=threshold, title=title)

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.plots import style
-from tflane_jax.plots.bev import GROUND, VIEW, Layer, draw_found, draw_scene, truth_layers
+from tflane_jax.plots.bev import GROUND, INPUTS, VIEW, Layer, draw_found, draw_scene, inputs_title, truth_layers
 from tflane_jax.plots.figure import new_figure, save_figure
 from tflane_jax.plots.gallery import label_edges, panel_size
 from tflane_jax.plots.legends import (
@@ -23,6 +23,7 @@ from tflane_jax.plots.legends import (
     visibility_entries,
 )
 from tflane_jax.plots.map_lines import class_entries
+from tflane_jax.plots.priors import prior_entries
 from tflane_jax.plots.segments import LanePrediction, truth_lines
 from tflane_jax.scene import BevChannel, Example, RoadUser, row_of
 
@@ -63,7 +64,7 @@ def save_differences(
     ground: PerceptionRange = GROUND,
     view: PerceptionRange = VIEW,
 ) -> Path:
-    """Write one row per example: truth | evidence and traffic | one panel per model.
+    """Write one row per example: truth | evidence and priors | one panel per model.
 
     Outlined lanes are marked in every panel. In that of a model, the outline is filled if the model finds the lane and
     dashed if it misses it.
@@ -96,8 +97,7 @@ def save_differences(
             view=view,
             title=f"truth, {name}",
         )
-        layers = ("evidence", "traffic")
-        draw_scene(seen, example, layers=layers, ground=ground, view=view, title="evidence and traffic")
+        draw_scene(seen, example, layers=INPUTS, ground=ground, view=view, title=inputs_title(example))
         for ax in (truth, seen):
             draw_outlines(ax, lanes[outlined[row]])
         for ax, (model, findings) in zip(places, models.items(), strict=True):
@@ -108,7 +108,7 @@ def save_differences(
             draw_outlines(ax, lanes[found], "filled")
             draw_outlines(ax, lanes[outlined[row] & ~found], "dashed")
     label_edges(axes)
-    _add_legend(figure, caption, meaning, drawn=truth_layers(shown))
+    _add_legend(figure, caption, meaning, truth_layers(shown), prior_entries(examples))
     return save_figure(figure, path)
 
 
@@ -141,7 +141,7 @@ def band(line: Float[np.ndarray, "n 2"], half_width: float) -> Float[np.ndarray,
     return np.concatenate([line - half_width * left, (line + half_width * left)[::-1]])
 
 
-def _add_legend(figure: Figure, caption: str, meaning: str, *, drawn: Collection[Layer]) -> None:
+def _add_legend(figure: Figure, caption: str, meaning: str, drawn: Collection[Layer], priors: Sequence[Any]) -> None:
     from matplotlib.patches import Patch
 
     edge = {"edgecolor": style.OUTLINE, "lw": 1.3}
@@ -159,6 +159,7 @@ def _add_legend(figure: Figure, caption: str, meaning: str, *, drawn: Collection
             Patch(facecolor=style.EVIDENCE[channel], label=f"evidence: {channel.name.lower().replace('_', ' ')}")
             for channel in (BevChannel.LANE_PAINT, BevChannel.ROAD_EDGE, BevChannel.OBSTACLE)
         ),
+        *priors,
         *(boundary_entries() if "segments" in drawn else ()),
     ]
     legend = figure.legend(

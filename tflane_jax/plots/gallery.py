@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import numpy as np
 
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.plots import style
-from tflane_jax.plots.bev import GROUND, VIEW, Layer, draw_found, draw_scene, truth_layers
+from tflane_jax.plots.bev import GROUND, INPUTS, VIEW, Layer, draw_found, draw_scene, inputs_title, truth_layers
 from tflane_jax.plots.figure import hide_unused, new_figure, save_figure
 from tflane_jax.plots.legends import (
     boundary_entries,
@@ -22,6 +22,7 @@ from tflane_jax.plots.legends import (
     visibility_entries,
 )
 from tflane_jax.plots.map_lines import class_entries
+from tflane_jax.plots.priors import prior_entries
 from tflane_jax.plots.segments import LanePrediction
 from tflane_jax.scene import Example, row_of
 
@@ -51,7 +52,7 @@ def save_examples(
     view: PerceptionRange = VIEW,
     threshold: float = 0.3,
 ) -> Path:
-    """Write one row per example: truth | evidence and traffic | one panel per model; many models take several lines.
+    """Write one row per example: truth | evidence and priors | one panel per model; many models take several lines.
 
     Args:
         path: .png, .pdf or .svg.
@@ -91,13 +92,11 @@ def save_examples(
             view=view,
             title=f"{title}: truth",
         )
-        draw_scene(
-            seen, example, layers=("evidence", "traffic"), ground=ground, view=view, title="evidence and traffic"
-        )
+        draw_scene(seen, example, layers=INPUTS, ground=ground, view=view, title=inputs_title(example))
         for ax, (name, stacked) in zip(columns, predictions.items(), strict=True):
             draw_found(ax, example, row_of(stacked, row), ground=ground, view=view, threshold=threshold, title=name)
     label_edges(axes)
-    add_legend(figure, "with predictions" if predictions else "scenes", drawn=true)
+    add_legend(figure, "with predictions" if predictions else "scenes", drawn=true, priors=prior_entries(examples))
     return save_figure(figure, path)
 
 
@@ -112,7 +111,7 @@ def show_dataset(
 ) -> Path:
     """Write a contact sheet of `count` examples spread evenly over the dataset (all of them if it has fewer).
 
-    Each has two panels: the truth, and evidence with traffic.
+    Each has two panels: the truth, and evidence with priors.
 
     Args:
         dataset: the examples.
@@ -130,9 +129,11 @@ def show_dataset(
     pairs, inches, dpi = (2, _SMALL_PANEL_WIDTH, _SMALL_PANEL_DPI) if len(chosen) > 1 else (1, _PANEL_WIDTH, 110)
     figure, axes = new_figure(-(-len(chosen) // pairs), 2 * pairs, panel=panel_size(view, inches), footer=_FOOTER)
     true: tuple[Layer, ...] = ()
+    priors: list = []
     for (truth, seen), index in zip(axes.reshape(-1, 2), chosen.tolist(), strict=False):
         example, info = dataset.example(index), dataset.info(index)
         true = truth_layers(None) if example.map_lines is None else ("map_lines",)
+        priors = prior_entries(example)
         draw_scene(
             truth,
             example,
@@ -141,19 +142,28 @@ def show_dataset(
             view=view,
             title=f"{f'{index}: {info.scene[:16]}' if titles is None else titles[index]}, truth",
         )
-        draw_scene(
-            seen, example, layers=("evidence", "traffic"), ground=ground, view=view, title="evidence and traffic"
-        )
+        draw_scene(seen, example, layers=INPUTS, ground=ground, view=view, title=inputs_title(example))
     hide_unused(axes, 2 * len(chosen))
     label_edges(axes)
-    add_legend(figure, "scenes", drawn=true)
+    add_legend(figure, "scenes", drawn=true, priors=priors)
     return save_figure(figure, out, dpi=dpi)
 
 
 def add_legend(
-    figure: Figure, kind: Literal["scenes", "with predictions"] = "scenes", *, drawn: Collection[Layer] = ("lanes",)
+    figure: Figure,
+    kind: Literal["scenes", "with predictions"] = "scenes",
+    *,
+    drawn: Collection[Layer] = ("lanes",),
+    priors: Sequence[Any] = (),
 ) -> None:
-    """Add the legend of all colours below the panels, once for the figure, for the `drawn` layers of true lanes."""
+    """Add the legend of all colours below the panels, once for the figure.
+
+    Args:
+        figure: with evidence and traffic.
+        kind: whether it has predictions.
+        drawn: layers of true lanes.
+        priors: entries of other priors than traffic, see `prior_entries`.
+    """
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
@@ -168,6 +178,7 @@ def add_legend(
             Patch(facecolor=colour, label=f"evidence: {channel.name.lower().replace('_', ' ')}")
             for channel, colour in style.EVIDENCE.items()
         ),
+        *priors,
     ]
     if kind == "with predictions":
         entries.append(truth_entry())

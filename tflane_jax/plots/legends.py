@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from tflane_jax.plots import style
+from tflane_jax.plots.priors import prior_entries
 from tflane_jax.plots.segments import LINE_STYLES, LanePrediction
 from tflane_jax.scene import Example, LinePrediction, LineType
 
@@ -72,5 +73,6 @@ def crossing_entry() -> Patch:
 def above_entries(lanes: LanePrediction | None, examples: Example) -> list:
     """Return the entries of a legend for the view from above, beside camera images that explain the rest."""
     if lanes is None:
-        return [hidden_entry(), *([] if examples.map_lines is not None else visibility_entries())]
+        lanes_seen = [] if examples.map_lines is not None else visibility_entries()
+        return [hidden_entry(), *lanes_seen, *prior_entries(examples)]
     return [] if isinstance(lanes, LinePrediction) else [truth_entry(), *prediction_entries()]

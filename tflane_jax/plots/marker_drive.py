@@ -38,14 +38,14 @@ _FONT, _LABEL = 6, np.array([0.06, 0.016])
 _LINE = 0.06
 # Boards by what became of them; lanes of a marker from no to full confidence.
 OUTCOMES: dict[Outcome, str] = {
-    "used": "#34c759",
+    "used": style.BOARD,
     "unknown": "#ffcc00",
     "stale": "#ff9d3c",
     "contradictory": "#ff3b30",
     "dropped": "#c8ccd4",
     "no lanes": "#5ac8fa",
 }
-_DOUBTED, _TRUSTED = np.array([0.45, 0.30, 0.36]), np.array([1.0, 0.93, 0.35])
+_DOUBTED, _TRUSTED = np.array([0.45, 0.30, 0.36]), np.array(style.BOARD_LANE)
 
 
 def save_drive_frame(

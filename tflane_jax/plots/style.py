@@ -56,6 +56,10 @@ ROAD_USER = {
     RoadUser.PEDESTRIAN: "#f6e58d",
 }
 
+# Boards of markers that are used, with the lanes of their store (in drives, by confidence), and roads of an SD map.
+BOARD, BOARD_LANE = "#34c759", (1.00, 0.93, 0.35)
+SD_ROAD = "#c98bb0"
+
 # OpenLane-V2 attributes of a traffic light; any other state or element is drawn in grey.
 LIGHT = {1: "#ff3b30", 2: "#34c759", 3: "#ffcc00"}
 OTHER_ELEMENT = "#c8ccd4"

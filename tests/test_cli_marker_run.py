@@ -266,3 +266,18 @@ def test_two_drives_do_not_share_a_folder(tmp_path, monkeypatch, capsys):
     (tmp_path / "images").mkdir()
     assert main(["markers", "render", "--log", "1", "--out", str(tmp_path)]) == 2
     assert "is not empty: choose another folder" in capsys.readouterr().err
+
+
+def test_frames_before_an_error_are_kept(drive, tmp_path, monkeypatch):
+    drawn = marker_run.save_drive_frame
+
+    def draw(path, *rest, **more):
+        if path.name == "002.png":
+            raise UserError("full")
+        return drawn(path, *rest, **more)
+
+    monkeypatch.setattr(marker_run, "save_drive_frame", draw)
+    assert main(arguments(drive, tmp_path / "out")) == 2
+    written = json.loads((tmp_path / "out" / "frames.json").read_text())
+    assert not written["complete"]
+    assert [frame["picture"] for frame in written["frames"]] == ["000.png", "001.png"]

@@ -62,15 +62,22 @@ def test_two_boards_with_one_id_are_both_reported(tmp_path, capsys):
     said = capsys.readouterr()
     assert said.out.count("contradictory") == 2
     assert "twice.png: marker 42 is at several places, x and y (9.0, -2.0) and (15.0, 2.0) m" in said.err
+    (picture,) = out.glob("*.png")
+    red = (cv2.imread(str(picture))[..., ::-1] == (255, 59, 48)).all(-1)
+    assert (cv2.imread(str(tmp_path / "twice.png"))[..., ::-1] == (255, 59, 48)).all(-1).sum() < red.sum() - 100
 
 
 @pytest.mark.parametrize("middle", [(480, 260), (5, 5), (955, 5), (5, 535), (955, 535)])
 def test_the_label_of_a_board_lies_in_the_picture(middle):
     outline = np.add(middle, [(-20, -20), (20, -20), (20, 20), (-20, 20)])
-    left, bottom = _label_place(outline, (130, 12), (960, 540), 4)
-    assert 0 <= left <= 960 - 130
-    assert 12 <= bottom <= 540
-    assert bottom - 12 >= outline[:, 1].max() or bottom <= outline[:, 1].min()
+    taken = []
+    for _ in range(3):  # of boards at one place: no label lies on another
+        left, bottom = _label_place(outline, (130, 12), (960, 540), 4, taken)
+        assert 0 <= left <= 960 - 130
+        assert 12 <= bottom <= 540
+        assert bottom - 12 >= outline[:, 1].max() or bottom <= outline[:, 1].min()
+        assert all(bottom - 12 >= lower or bottom <= upper for _, upper, _, lower in taken)
+        taken.append((left, bottom - 12, left + 130, bottom))
 
 
 def test_distance_is_proportional_to_marker_size(photos, tmp_path):
@@ -136,3 +143,13 @@ def test_curves_refuse_invalid_settings_by_the_name_of_the_option(option, tmp_pa
     assert said.startswith("tflane: --")
     assert option.split()[0] in said
     assert not (tmp_path / "out").exists()
+
+
+def test_curves_name_distances_at_which_no_image_has_a_board(tmp_path, capsys):
+    arguments = ["markers", "curves", "--seeds", "1", "--scales", "0.3", "--corners", "subpixel"]
+    assert main([*arguments, "--out", str(tmp_path / "out"), "--distances", "1.5"]) == 2
+    assert "no board lies wholly in an image at 1.5 m: give larger --distances" in capsys.readouterr().err
+    assert main([*arguments, "--out", str(tmp_path / "out"), "--distances", "1.5", "12", "12"]) == 0
+    assert "no board lies wholly in an image at 1.5 m, left out of the table" in capsys.readouterr().err
+    written = json.loads((tmp_path / "out" / "curves-subpixel-0.3.json").read_text())
+    assert [(row["distance m"], row["boards"]) for row in written["rows"]] == [(12.0, 3)]  # once, though given twice

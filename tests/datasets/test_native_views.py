@@ -103,3 +103,10 @@ def test_images_are_resized_as_those_of_the_training(native, change):
 def test_models_that_these_images_do_not_suit_are_refused(native, source, message):
     with pytest.raises(UserError, match=message):
         fitted_views(native, source)
+
+
+def test_a_camera_whose_images_do_not_fit_is_refused_before_it_has_one(native):
+    """Its size is known from the calibration or from a later frame."""
+    absent = native.replace(valid=np.array([False]), size=np.array([[960, 700]]))
+    with pytest.raises(UserError, match="images of camera front are 960 x 700 pixels, which does not fit"):
+        fitted_views(absent, world(MOUNT, scale=0.25))

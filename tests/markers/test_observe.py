@@ -1,5 +1,7 @@
 """From detected markers to lanes in the ego frame."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -162,6 +164,32 @@ def test_the_residual_of_a_first_sighting():
     assert observe(detected, STORE, RANGE, **SIZES).markers.residual.tolist() == [0.0, 0.0, 0.0]
     with pytest.raises(ValueError, match="now_from_previous"):
         observe(detected, STORE, RANGE, previous=before, **SIZES)
+
+
+def test_an_id_that_was_at_two_places_before_is_compared_with_both():
+    """Whichever of the two boards is seen next, it may be the wrong one."""
+    stands, copy = PLACED.pose[0], PLACED.pose[0].copy()
+    copy[0, 3] -= 8.0
+    twice = detect([stands, copy], (5, 5), score=[0.5, 0.9])
+    for flags, of_stands, of_copy in (([True, True], 8.0, 8.0), ([False, False], 8.0, 0.0)):
+        before = SimpleNamespace(**twice._asdict(), contradictory=np.array(flags))
+        seen = [
+            observe(detect([pose], (5,)), STORE, RANGE, previous=before, now_from_previous=np.eye(4), **SIZES)
+            for pose in (stands, copy)
+        ]
+        found = [float(each.markers.residual[0]) for each in seen]
+        np.testing.assert_allclose(found, [of_stands, of_copy], atol=1e-4)
+
+
+def test_boards_without_lanes_take_no_place_of_one_that_has_them():
+    """They are nearer, and the prior has room for two."""
+    bare = {i: StoredMarker(i, np.eye(4), np.zeros((0, 2, 3)), np.zeros((0, 0), bool)) for i in (1, 4)}
+    store = MarkerStore({**bare, 5: STORE.markers[5]}, "survey")
+    poses = [yaw_pose(*np.array(place)[:, None])[0] for place in ((5.0, 0, 0), (6.0, 0, 0), (20.0, 0, 0))]
+    found = observe(detect(poses, (1, 4, 5)), store, RANGE, **SIZES | {"markers": 2})
+    assert found.outcomes == {5: "used", 1: "no lanes", 4: "dropped"}
+    assert found.markers.marker_id.tolist() == [5, 1]
+    assert found.markers.lane_valid[0].any()
 
 
 def test_a_marker_without_lanes_has_the_residual_of_its_place():

@@ -133,3 +133,18 @@ def test_an_arrow_on_a_traffic_sign_is_no_board():
 @pytest.mark.parametrize("shape", [(5, 5), (40, 40)])
 def test_small_and_empty_images(shape):
     assert find_occluded(np.full(shape, 100, np.uint8), ARUCO, 8.0) == []
+
+
+def test_a_whole_board_of_another_family_member_is_not_read_as_a_known_one():
+    """Ids 0 and 16 of this family differ in three cells, which the search for hidden boards allows for."""
+    family = MarkerFamily.ARUCO_ORIGINAL
+    truth = pose(15.0, -0.2, 1.8)
+    grey = photo(AHEAD, {0: truth}, family).mean(-1).astype(np.uint8)
+    corners = marker_outline(truth, 1.0, AHEAD.intrinsics, AHEAD.camera_from_ego)
+    left, top, right, bottom = (int(v) for v in (*corners.min(0) - 60, *corners.max(0) + 60))
+    part = grey[top:bottom, left:right].copy()
+    known = DetectorConfig(family, search="all", ids=(16,))
+    assert [each.marker_id for each in find_occluded(part, family, 12.0, known.ids)] == [16]
+    found = find_markers(part, known)
+    assert found.marker_id.tolist() == [0]
+    assert found.wrong_bits.tolist() == [0]

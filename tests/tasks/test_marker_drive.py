@@ -181,11 +181,22 @@ def test_frames_at_another_rate_than_in_training_are_warned_of(seconds, warns):
     times = (np.arange(6) * seconds * SECOND).astype(np.int64)
     with warnings.catch_warnings(record=True) as found:
         warnings.simplefilter("always")
-        check_rate(times.tolist(), 0.5)
-        check_rate([*times[times < 0], 0, SECOND // 2, SECOND, 60 * SECOND], 0.5)  # a pause is no rate
-        check_rate([0], 0.5)
+        check_rate(times.tolist(), 0.5, 0.5)
+        check_rate([*times[times < 0], 0, SECOND // 2, SECOND, 60 * SECOND], 0.5, 0.5)  # a pause is no rate
+        check_rate([0], 0.5, 0.5)
     assert [warning.category for warning in found] == [FrameRateWarning] * warns
-    assert all("--interval" in str(warning.message) for warning in found)
+    # A drive can be thinned only.
+    assert all(("--interval" in str(warning.message)) == (seconds < 0.5) for warning in found)
+
+
+@pytest.mark.parametrize(("seconds", "interval", "warns"), [(0.8, 0.5, True), (0.7, 0.5, False), (2.0, None, False)])
+def test_a_drive_too_slow_for_residuals_is_warned_of_whatever_the_model_remembers(seconds, interval, warns):
+    times = (np.arange(4) * seconds * SECOND).astype(np.int64).tolist()
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        check_rate(times, None, interval)
+    assert [warning.category for warning in found] == [FrameRateWarning] * warns
+    assert all("4 of 4 frames have none about 0.5 s before them" in str(warning.message) for warning in found)
 
 
 def test_a_drive_is_thinned_to_the_frames_nearest_to_an_interval():

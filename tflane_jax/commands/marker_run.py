@@ -1,12 +1,13 @@
 """`tflane markers run` and `tflane markers render`.
 
 `run` reads a drive (`datasets.drive_files`) and a store, and writes a picture for each frame and frames.json:
-    {"store", "model", "threshold", "frames": [{"timestamp_ns", "picture", "gate", "remembered",
+    {"store", "model", "threshold", "complete", "frames": [{"timestamp_ns", "picture", "gate", "remembered",
      "boards": [{"id", "outcome", "score", "size", "position", "distance", "camera", "corners", "residual",
                  "confidence"}, ...],
      "guidance": [{"weight", "points": [[x, y], ...]}, ...],
      "lanes": [{"score", "points": [[x, y, z], ...]}, ...]}, ...],
      "faults": [{"file", "error"}, ...]}
+    "complete" is false if an error ended the command, and the frames are those before it.
     "outcome" is one of `markers.observe.Outcome`; "residual" and "confidence" exist for boards that give a prior,
     "lanes" with a model. An id that was read at two places has two entries. Coordinates are in the ego frame, metres;
     corners of the black square are pixels of the camera's undistorted image. `faults` are images that could not be
@@ -87,13 +88,19 @@ def run(options: argparse.Namespace) -> int:
     if model is not None:
         # A model that cannot read these images is refused before they are searched, which takes seconds each.
         fitted_views(drive.views(drive.frames[0], faults), model.source)
-    if steps.remembers:
-        check_rate([frame.timestamp_ns for frame in drive.frames], steps.interval)
+    times = [frame.timestamp_ns for frame in drive.frames]
+    check_rate(times, steps.interval if steps.remembers else None, steps.reader.config.residual_interval)
     make_folder(options.out)
-    frames, outcomes = _follow(drive, steps, detector, range_, faults, options)
+    frames: list[dict[str, Any]] = []
     head = {"store": str(options.store), "model": None if options.model is None else str(options.model)}
-    told = [{"file": file, "error": error} for file, error in faults.items()]
-    write_json(options.out / "frames.json", head | {"threshold": options.threshold, "frames": frames, "faults": told})
+    head |= {"threshold": options.threshold}
+    try:
+        _follow(drive, steps, detector, range_, faults, options, frames)
+    finally:
+        told = [{"file": file, "error": error} for file, error in faults.items()]
+        complete = len(frames) == len(drive.frames)
+        write_json(options.out / "frames.json", head | {"complete": complete, "frames": frames, "faults": told})
+    outcomes = Counter(board["outcome"] for frame in frames for board in frame["boards"])
     boards = {f"boards {name}": outcomes[name] for name in get_args(Outcome)}
     guided = sum(bool(frame["guidance"]) for frame in frames)
     remembered = sum(frame["remembered"] for frame in frames)
@@ -116,12 +123,10 @@ def _follow(
     view: PerceptionRange,
     faults: dict[str, str],
     options: argparse.Namespace,
-) -> tuple[list[dict[str, Any]], Counter[str]]:
-    """Process all frames and draw each; return their records and how many boards had each outcome.
-
-    Images that cannot be read are added to `faults`.
-    """
-    frames, outcomes, names = [], Counter(), [camera.name for camera in drive.cameras]
+    frames: list[dict[str, Any]],
+) -> None:
+    """Process all frames and draw each; their records are added to `frames`, images that cannot be read to `faults`."""
+    names = [camera.name for camera in drive.cameras]
     with warnings.catch_warnings():
         # The table counts them.
         warnings.simplefilter("ignore", UnknownMarkerWarning)
@@ -130,9 +135,6 @@ def _follow(
             views = drive.views(frame, faults)
             step = steps.step(views, frame.timestamp_ns, frame.global_from_ego, search_views(views, detector))
             picture = f"{number:03d}.png"
-            record = {"timestamp_ns": frame.timestamp_ns, "picture": picture}
-            frames.append(record | _record(step, views, names, options.threshold))
-            outcomes.update(board["outcome"] for board in frames[-1]["boards"])
             save_drive_frame(
                 options.out / picture,
                 views,
@@ -146,7 +148,8 @@ def _follow(
                 title=frame_title(number, step.guidance, remembered=step.remembered),
                 threshold=options.threshold,
             )
-    return frames, outcomes
+            record = {"timestamp_ns": frame.timestamp_ns, "picture": picture}
+            frames.append(record | _record(step, views, names, options.threshold))
 
 
 def _model(folder: Path) -> DriveModel:

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,18 +30,20 @@ from tflane_jax.files.atomic import check_folder, write_bytes, write_json
 from tflane_jax.files.images import check_centre, list_photos, opencv, read_image, undistorted
 from tflane_jax.geometry.cameras import project
 from tflane_jax.limits import check_settings
-from tflane_jax.markers.curves import CurveConfig, measure, summarise
+from tflane_jax.markers.curves import CurveConfig, Sighting, measure, summarise
 from tflane_jax.markers.detection import DetectedMarkers, detect
 from tflane_jax.markers.image_search import DetectorConfig
 from tflane_jax.markers.square_pose import marker_outline
 from tflane_jax.plots import format_table, save_table
 from tflane_jax.plots.marker_curves import save_error_curves
 from tflane_jax.scene import CameraViews
-from tflane_jax.scene.marker_patterns import MarkerFamily
+from tflane_jax.scene.marker_patterns import MarkerFamily, board_size
 from tflane_jax.world.render.camera import camera_pose
 
 _AXES = np.array([(255, 40, 40), (40, 200, 40), (60, 90, 255)])
-_OUTLINE = (255, 210, 0)
+_OUTLINE, _CONTRADICTORY, _DARK = (255, 210, 0), (255, 59, 48), (27, 31, 39)
+
+Box = tuple[int, int, int, int]
 
 
 def find(options: argparse.Namespace) -> int:
@@ -83,7 +86,7 @@ def find(options: argparse.Namespace) -> int:
         photo = undistorted(photo, intrinsics, distortion)
         found = detect(_views(photo, intrinsics, pose), config)
         picture = f"{number:03d}-{path.stem}-markers.png"
-        _write_picture(options.out / picture, photo, found, config.size, intrinsics, pose)
+        _write_picture(options.out / picture, photo, found, config.size, config.family, intrinsics, pose)
         here = [_record(found, k, intrinsics, pose) for k in np.flatnonzero(found.valid).tolist()]
         twice += _contradictions(path, here)
         records.append({"file": str(path), "picture": picture, "markers": here})
@@ -115,19 +118,34 @@ def curves(options: argparse.Namespace) -> int:
     if not options.sigma_d > 0.0:
         raise UserError(f"--sigma-d must be a positive distance in metres, not {options.sigma_d:g}")
     check_folder(options.out)
+    options.distances = list(dict.fromkeys(options.distances))
     configs = {scale: [_curve(options, scale, corners) for corners in options.corners] for scale in options.scales}
     make_folder(options.out)
     drawn: dict[str, list[dict[str, Any]]] = {}
     for scale, several in configs.items():  # all corner methods see the same scenes
         for corners, config, sightings in zip(options.corners, several, measure(several), strict=True):
             name = f"{corners}, scale {scale:g}"
-            drawn[name] = summarise(sightings)
+            drawn[name] = _summary(sightings, options.distances, name)
             stem = options.out / f"curves-{corners}-{scale:g}"
             meta = {"config": str(config), "boards": [vars(sighting) for sighting in sightings]}
             save_table(stem, drawn[name], meta, title=name)
             print(format_table(drawn[name], title=name) + "\n")
     print("written to", save_error_curves(options.out / "curves.png", drawn, options.sigma_d))
     return 0
+
+
+def _summary(sightings: Sequence[Sighting], distances: Sequence[float], name: str) -> list[dict[str, Any]]:
+    """Return the rows of a curve; warn of distances without a board, raise UserError if all are."""
+    seen = {sighting.distance for sighting in sightings}
+    absent = ", ".join(f"{distance:g}" for distance in distances if distance not in seen)
+    if not seen:
+        raise UserError(f"{name}: no board lies wholly in an image at {absent} m: give larger --distances")
+    if absent:
+        print(
+            f"tflane: warning: {name}: no board lies wholly in an image at {absent} m, left out of the table",
+            file=sys.stderr,
+        )
+    return summarise(sightings)
 
 
 def _curve(options: argparse.Namespace, scale: float, corners: Any) -> CurveConfig:
@@ -200,13 +218,14 @@ def _write_picture(
     photo: UInt8[np.ndarray, "h w 3"],
     found: DetectedMarkers,
     size: float,
+    family: MarkerFamily,
     intrinsics: Float[np.ndarray, "3 3"],
     camera_from_ego: Float[np.ndarray, "4 4"],
 ) -> None:
     cv2 = opencv()
     image = np.ascontiguousarray(photo)
-    width = max(1, round(max(image.shape) / 900))
-    font = cv2.FONT_HERSHEY_SIMPLEX, 0.5 * width, width
+    width, taken = max(1, round(max(image.shape) / 900)), []
+    font = cv2.FONT_HERSHEY_SIMPLEX, 0.5 * width
 
     def fixed(pixels: np.ndarray) -> np.ndarray:
         return np.round((np.clip(pixels, -8000.0, 8000.0) - 0.5) * 16).astype(np.int32)
@@ -214,24 +233,40 @@ def _write_picture(
     for k in np.flatnonzero(found.valid).tolist():
         pose = np.asarray(found.pose[k], np.float64)
         outline = marker_outline(pose, size, intrinsics, camera_from_ego)
-        cv2.polylines(image, [fixed(outline)], True, _OUTLINE, width, cv2.LINE_AA, 4)
+        colour = _CONTRADICTORY if found.contradictory[k] else _OUTLINE
+        cv2.polylines(image, [fixed(outline)], True, colour, width, cv2.LINE_AA, 4)
         ends = pose[:3, 3] + np.concatenate([np.zeros((1, 3)), 0.75 * size * pose[:3, :3].T])
         pixels, _, ahead = project(ends, intrinsics, camera_from_ego)
         for axis in np.flatnonzero(ahead[1:]).tolist():
             start, end = fixed(pixels[[0, axis + 1]]).tolist()
             cv2.line(image, start, end, _AXES[axis].tolist(), 2 * width, cv2.LINE_AA, 4)
         words = f"{found.marker_id[k]}: {np.linalg.norm(pose[:2, 3]):.1f} m, {found.score[k]:.2f}"
-        place = _label_place(outline, cv2.getTextSize(words, *font)[0], image.shape[1::-1], 4 * width)
-        cv2.putText(image, words, place, font[0], font[1], _OUTLINE, font[2], cv2.LINE_AA)
+        words += ", contradictory" if found.contradictory[k] else ""
+        board = marker_outline(pose, board_size(family, size), intrinsics, camera_from_ego)
+        text = cv2.getTextSize(words, *font, width)[0]
+        place = _label_place(board, text, image.shape[1::-1], 4 * width, taken)
+        taken.append((place[0], place[1] - text[1], place[0] + text[0], place[1]))
+        # A dark edge, so that it can be read on the sky and on paint.
+        for ink, thickness in ((_DARK, 4 * width), (colour, width)):
+            cv2.putText(image, words, place, *font, ink, thickness, cv2.LINE_AA)
     write_bytes(path, cv2.imencode(".png", image[..., ::-1])[1].tobytes())
 
 
 def _label_place(
-    outline: Float[np.ndarray, "4 2"], text: tuple[int, int], size: tuple[int, int], gap: int
+    board: Float[np.ndarray, "4 2"], text: tuple[int, int], size: tuple[int, int], gap: int, taken: Sequence[Box]
 ) -> tuple[int, int]:
-    """Return the lower left corner of a label: below the board, above it where there is no room, in the picture."""
-    low, high = outline.min(0), outline.max(0)
-    left = min(low[0], size[0] - text[0] - gap)
-    below = high[1] + gap + text[1]
-    bottom = below if below + gap <= size[1] else low[1] - gap
-    return int(max(left, 0)), int(np.clip(bottom, text[1], size[1] - gap))
+    """Return the lower left corner of a label in the picture, beside the labels whose boxes are `taken`.
+
+    It is below the board, above it where there is no room, and further down or up where another label is.
+    """
+    low, high = board.min(0), board.max(0)
+    left = int(max(min(low[0], size[0] - text[0] - gap), 0))
+    line = text[1] + gap
+    below = [round(high[1]) + line * number for number in range(1, len(taken) + 2)]
+    above = [round(low[1]) - gap - line * number for number in range(len(taken) + 1)]
+    inside = [bottom for bottom in (*below, *above) if text[1] <= bottom <= size[1] - gap]
+    for bottom in inside:
+        box = (left, bottom - text[1], left + text[0], bottom)
+        if not any(box[0] < r and l < box[2] and box[1] < b and t < box[3] for l, t, r, b in taken):
+            return left, bottom
+    return left, int(np.clip(below[0], text[1], size[1] - gap))

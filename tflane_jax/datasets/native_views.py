@@ -60,10 +60,10 @@ def _of_rig(views: CameraViews, rig: CameraRigConfig) -> CameraViews:
     _check_cameras(views, [mount.name for mount in rig.cameras])
     fits: list[ImageFit | None] = []
     for number, mount in enumerate(rig.cameras):
-        if not views.valid[number]:
+        width, height = np.asarray(views.size)[number].tolist()
+        if not width:  # no image, and none seen before
             fits.append(None)
             continue
-        width, height = np.asarray(views.size)[number].tolist()
         scale, (most_wide, most_high) = round(mount.width * rig.scale) / width, rig.size(mount)
         size = round(width * scale), round(height * scale)
         if size[0] > most_wide or size[1] > most_high:

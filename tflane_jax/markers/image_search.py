@@ -79,8 +79,8 @@ def find_markers(
 ) -> ImageMarkers:
     """Return the markers of the family in an undistorted image, RGB or grey.
 
-    An id found several times at one place is reported once, where its cells are read best; an id at several places is
-    reported at each. Raises UserError without OpenCV or for an invalid config.
+    Of several readings at one place the one counts whose cells are read best, of one id or of several; an id at several
+    places is reported at each. Raises UserError without OpenCV or for an invalid config.
     """
     check_settings(config, "DetectorConfig.")
     cv2 = opencv()
@@ -107,7 +107,7 @@ def find_markers(
             found.append(
                 _Reading(each.marker_id, (each.wrong_bits, _fit(cv2, grey, each.corners, cells)[1]), each.corners)
             )
-    return _as_arrays(_one_for_each_place(found), config.enlarge)
+    return _as_arrays(_best_ids(_one_for_each_place(found)), config.enlarge)
 
 
 def joined(parts: Sequence[ImageMarkers]) -> ImageMarkers:
@@ -117,7 +117,7 @@ def joined(parts: Sequence[ImageMarkers]) -> ImageMarkers:
         for part in parts
         for marker_id, corners, wrong in zip(part.marker_id, part.corners, part.wrong_bits, strict=True)
     ]
-    return _as_arrays(_one_for_each_place(found))
+    return _as_arrays(_best_ids(_one_for_each_place(found)))
 
 
 class _Reading(NamedTuple):
@@ -144,6 +144,18 @@ def _one_for_each_place(found: list[_Reading]) -> list[_Reading]:
         if not any(_overlap(each.corners, other.corners) for other in same):
             kept.append(each)
     return kept
+
+
+def _best_ids(found: list[_Reading]) -> list[_Reading]:
+    """Return the readings without those at whose place another id has fewer wrong cells.
+
+    The search for partly hidden boards takes known ids alone, so that it may read a whole board of another id, too.
+    """
+    return [
+        each
+        for each in found
+        if not any(other.rank[0] < each.rank[0] and _overlap(each.corners, other.corners) for other in found)
+    ]
 
 
 def _overlap(a: Float[np.ndarray, "4 2"], b: Float[np.ndarray, "4 2"]) -> bool:

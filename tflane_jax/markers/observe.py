@@ -82,13 +82,14 @@ def observe(
 ) -> Observed:
     """Return the stored lanes of the detected markers, moved into the ego frame by the detected poses.
 
-    Markers are ordered by distance; an id detected several times counts once, with its best score. Lanes are cut at the
-    perception range, as in the ground truth; each piece becomes a lane. A marker without lanes in the range is kept,
-    without lanes.
+    Markers are ordered by distance, those without lanes in the store last; an id detected several times counts once,
+    with its best score. Lanes are cut at the perception range, as in the ground truth; each piece becomes a lane. A
+    marker without lanes in the range is kept, without lanes.
 
     `residual` is r of Eq. (2) of the paper: the mean distance in the ground plane between the marker's stored lane
     points placed by this detection and by the previous one, after compensating the vehicle's motion. A marker without
-    lanes uses its own position.
+    lanes uses its own position. If the id was at several places before, which of them was right is not known: the
+    largest distance counts.
 
     Args:
         detected: at this moment; padding may hold anything.
@@ -115,17 +116,17 @@ def observe(
             outcomes[number] = "used" if len(entry.lanes) else "no lanes"
     known = [(row, entry) for row, entry in zip(rows, looked.found, strict=True) if entry is not None]
     poses = {int(row): np.asarray(detected.pose[row], np.float64) for row, _ in known}
-    known.sort(key=lambda pair: np.hypot(*poses[int(pair[0])][:2, 3]))
+    known.sort(key=lambda pair: (not len(pair[1].lanes), np.hypot(*poses[int(pair[0])][:2, 3])))
 
     out, lanes_dropped = MarkerObservations.empty(markers, lanes, points), 0
     for slot, (row, entry) in enumerate(known[:markers]):
         pose = poses[int(row)]
-        before = None if previous is None else _pose_of(previous, entry.marker_id)
+        before = [] if previous is None else _poses_of(previous, entry.marker_id)
         out.marker_id[slot], out.pose[slot], out.score[slot] = entry.marker_id, pose, detected.score[row]
         out.residual[slot] = (
             first_residual
-            if before is None or now_from_previous is None
-            else pose_residual(entry, pose, now_from_previous @ before)
+            if not before or now_from_previous is None
+            else max(pose_residual(entry, pose, now_from_previous @ each) for each in before)
         )
         out.valid[slot] = True
         lanes_dropped += _fill_lanes(out, slot, entry, pose, range_)
@@ -168,10 +169,12 @@ def _contradictory(detected: Detected) -> np.ndarray:
     return np.zeros(len(np.asarray(detected.valid)), bool) if flags is None else np.asarray(flags)
 
 
-def _pose_of(detected: Detected, marker_id: int) -> Float[np.ndarray, "4 4"] | None:
-    rows = _best(detected)
-    rows = rows[np.asarray(detected.marker_id)[rows] == marker_id]
-    return np.asarray(detected.pose[rows[0]], np.float64) if len(rows) else None
+def _poses_of(detected: Detected, marker_id: int) -> list[Float[np.ndarray, "4 4"]]:
+    """Return where a marker was detected: its best pose, all of them if they contradict each other, none if absent."""
+    mine = np.asarray(detected.valid) & (np.asarray(detected.marker_id) == marker_id)
+    several = mine & _contradictory(detected)
+    rows = np.flatnonzero(several) if several.any() else [row for row in _best(detected) if mine[row]]
+    return [np.asarray(detected.pose[row], np.float64) for row in rows]
 
 
 def _fill_lanes(

@@ -21,6 +21,7 @@ from tflane_jax.datasets.sources import source_of
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import relative_pose
 from tflane_jax.markers.image_search import ImageMarkers
+from tflane_jax.markers.observe import frame_before
 from tflane_jax.markers.reader import MarkerReader, ReaderConfig, Reading
 from tflane_jax.models.marker_fusion import MarkerFusionConfig, MarkerPrior, as_fused
 from tflane_jax.models.parameters import Params
@@ -174,21 +175,35 @@ def as_trained(config: ReaderConfig, model: DriveModel | None) -> ReaderConfig:
     return replace(config, **sizes, **residual)
 
 
-def check_rate(times_ns: Sequence[int], interval: float) -> None:
-    """Warn (`FrameRateWarning`) of a drive whose frames are not as far apart as `interval` seconds, up to 50 %.
+def check_rate(times_ns: Sequence[int], interval: float | None, residual_interval: float | None) -> None:
+    """Warn (`FrameRateWarning`) of a drive at a rate at which memory or residual do not mean what they should.
 
-    The median counts: a missing frame or a pause does not.
+    Args:
+        times_ns: of the frames.
+        interval: seconds between frames in training, for a model that remembers; the drive's may differ by 50 %. The
+            median counts: a missing frame or a pause does not. None: rates do not matter to the model.
+        residual_interval: see `ReaderConfig`; most frames need another one about as long before them.
     """
     if len(times_ns) < 2:
         return
-    found = float(np.median(np.diff(np.asarray(times_ns, np.int64)))) / 1e9
-    if abs(found - interval) > _OFF * interval:
-        warnings.warn(
-            f"frames are {found:.3g} s apart, in training {interval:.3g} s: memory counts frames, so that it lasts "
-            f"{found / interval:.2g} times as long as it should; take frames {interval:.3g} s apart (--interval)",
-            FrameRateWarning,
-            stacklevel=2,
+    times = np.asarray(times_ns, np.int64)
+    found, told, dense = float(np.median(np.diff(times))) / 1e9, [], False
+    if interval is not None and abs(found - interval) > _OFF * interval:
+        dense = found < interval
+        told.append(
+            f"in training {interval:.3g} s: memory counts frames, so that it lasts {found / interval:.2g} times as "
+            "long as it should"
         )
+    if residual_interval is not None and found > residual_interval:
+        alone = sum(frame_before(times[:i], times[i], residual_interval) is None for i in range(1, len(times)))
+        if 2 * alone > len(times) - 1:
+            told.append(
+                f"{alone + 1} of {len(times)} frames have none about {residual_interval:.3g} s before them to compare "
+                "boards with: their residual is 0, so that a board read at a wrong place is trusted like any other"
+            )
+    if told:
+        remedy = f"take frames {interval:.3g} s apart (--interval)" if dense else "give frames that are less far apart"
+        warnings.warn(f"frames are {found:.3g} s apart; {'; '.join(told)}; {remedy}", FrameRateWarning, stacklevel=2)
 
 
 def check_model(task: Any) -> LaneGraphTask:

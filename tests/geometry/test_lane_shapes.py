@@ -16,7 +16,7 @@ from tests.geometry.ground_curves import (
     tilted_image_curve,
 )
 from tflane_jax.geometry.cameras import project
-from tflane_jax.geometry.lane_shapes import curve_columns
+from tflane_jax.geometry.lane_shapes import curve_columns, order_from_left
 
 FOCAL, HEIGHT = 1000.0, 1.6
 AHEAD = np.linspace(8.0, 90.0, 30)
@@ -123,3 +123,15 @@ def test_the_horizon_is_a_pole_only_beyond_the_least_depth():
 @pytest.mark.parametrize("shape", [(0, 5), (3, 0), (1, 1)])
 def test_sizes(shape):
     assert curve_columns(np.zeros((shape[0], 6)), np.ones(shape)).shape == shape
+
+
+def test_lanes_are_in_order_where_the_outer_one_leaves_the_image_higher_up():
+    """Lanes that meet in (0.5, 0.4) and are cut at the sides of an image of width 1: both outer right ones end at 1."""
+    slopes = np.array([3.0, -0.4, -3.0, 0.8, 8.0])
+    ends = np.minimum(0.4 + 0.5 / np.abs(slopes), 0.98)
+    lanes = np.zeros((5, 8))
+    lanes[:, 0], lanes[:, 1], lanes[:, 6], lanes[:, 5] = 0.45, ends, slopes, 0.5 - 0.4 * slopes
+    assert order_from_left(lanes).tolist() == [2, 1, 3, 0, 4]
+    assert np.argsort(0.5 + slopes * (ends - 0.4), kind="stable").tolist() != [2, 1, 3, 0, 4]  # at their own lower ends
+    for count in (0, 1):
+        assert order_from_left(lanes[:count]).tolist() == list(range(count))

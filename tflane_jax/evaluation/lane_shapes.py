@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from tflane_jax.files.tusimple import NO_POINT, RowLanes
-from tflane_jax.geometry.lane_shapes import curve_columns
+from tflane_jax.geometry.lane_shapes import curve_columns, order_from_left
 from tflane_jax.scene import CurvePrediction
 
 
@@ -22,11 +22,9 @@ def detected(prediction: CurvePrediction, threshold: float | None = None) -> Boo
 
 
 def left_to_right(prediction: CurvePrediction, threshold: float | None = None) -> Int[np.ndarray, " l"]:
-    """Return the indices of detected queries (see `detected`), ordered by the column of their lower end."""
+    """Return the indices of detected queries (see `detected`), from left to right, see `order_from_left`."""
     queries = np.flatnonzero(detected(prediction, threshold))
-    curves = np.asarray(prediction.curves, np.float64)[queries]
-    ends = curve_columns(curves[:, 2:], curves[:, 1:2])[:, 0]
-    return queries[np.argsort(ends, kind="stable")]
+    return queries[order_from_left(np.asarray(prediction.curves, np.float64)[queries])]
 
 
 def detections_of_curves(

@@ -10,7 +10,8 @@ docs/gtn_lane.md says how it follows from Eq. (5) and (6).
 
 from __future__ import annotations
 
-from jaxtyping import Float
+import numpy as np
+from jaxtyping import Float, Int
 
 from tflane_jax.geometry.namespace import AnyArray, ArrayT, namespace
 
@@ -30,3 +31,16 @@ def curve_columns(
     below = rows - f
     below = xp.where(xp.abs(below) < least, least, below)
     return k / below**2 + m / below + n + b * rows - offset  # Eq. (7)
+
+
+def order_from_left(curves: Float[np.ndarray, "l 8"]) -> Int[np.ndarray, " l"]:
+    """Return the order of lanes from left to right, all of them continued down to the lowest lower end.
+
+    At their own lower ends they would not compare: of two lanes that leave the image at its side, the one farther out
+    does so higher up.
+
+    Args:
+        curves: upper and lower row of each lane, then the coefficients of Eq. (7); numpy.
+    """
+    lowest = np.broadcast_to(curves[:, 1:2].max(initial=-np.inf), (len(curves), 1))
+    return np.argsort(curve_columns(curves[:, 2:], lowest)[:, 0], kind="stable")

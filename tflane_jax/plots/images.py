@@ -110,7 +110,7 @@ def lanes_drawn(
 
 
 def predicted_lines(prediction: CurvePrediction, threshold: float | None = None) -> Float[np.ndarray, "l p 2"]:
-    """Return (u, v) of the detected lanes, left to right at their lower ends, as fractions of the image.
+    """Return (u, v) of the detected lanes, left to right, as fractions of the image.
 
     The points are those that TuSimple's metric reads, on its rows, between the ends of a lane; NaN elsewhere and
     outside the image. Between two rows a curve that ends above its own horizon f'' leaves the image and comes back from

@@ -27,7 +27,7 @@ from tflane_jax.evaluation.photo_lanes import (
 from tflane_jax.evaluation.predict import Predictor
 from tflane_jax.files.images import opencv
 from tflane_jax.geometry.cameras import inside_image
-from tflane_jax.geometry.lane_shapes import curve_columns
+from tflane_jax.geometry.lane_shapes import curve_columns, order_from_left
 from tflane_jax.models.parameters import Params
 from tflane_jax.scene import LaneLines, RoadImage, row_of
 from tflane_jax.tasks.lane_shape import predict_curves
@@ -208,11 +208,10 @@ class PhotoReader:
         curves = np.asarray(answer.curves, np.float64)
         # A lane that would end above its beginning has no points, as in TuSimple's metric.
         chosen = np.flatnonzero((scores >= threshold) & (curves[:, 1] > curves[:, 0]))
-        curves = curves[chosen]
+        chosen = chosen[order_from_left(curves[chosen])]
+        curves, scores = curves[chosen], scores[chosen]
         rows = np.linspace(curves[:, 0], curves[:, 1], _POINTS, axis=-1)
-        lanes = np.stack([curve_columns(curves[:, 2:], rows), rows], -1)
-        order = np.argsort(lanes[:, -1, 0], kind="stable")
-        lanes, scores = list(lanes[order]), scores[chosen][order]
+        lanes = list(np.stack([curve_columns(curves[:, 2:], rows), rows], -1))
         points = [_inside(view.to_photo(lane), grey.shape, view.top + HORIZON * view.height) for lane in lanes]
         return _ViewLanes(view, lanes, points, scores, judge_lanes(grey, view, lanes, scores))
 

@@ -34,6 +34,13 @@ def test_compact_is_in_percent():
     ]
 
 
+def test_compact_leaves_distances_in_metres():
+    both = [{"all/AE_dist": value, "all/AE_type": value} for value in (0.82, 0.84)]
+    assert compact({"base": both}, ["all/AE_dist", "all/AE_type"]) == [
+        {"model": "base", "all/AE_dist": "0.83 ± 0.01 m", "all/AE_type": "83.0 ± 1.4"}
+    ]
+
+
 def test_a_variant_is_paired_over_the_seeds_that_the_control_has():
     table = {
         "base": scores(0.1, 0.2, 0.3),

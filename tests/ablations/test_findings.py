@@ -7,8 +7,8 @@ import pytest
 
 from tests.ablations.effect_cases import CONTROL, DECLARED, PRIMARY, SEEDS, made_results, measured
 from tflane_jax.ablations.declaration import Claim, Declaration, Declared
-from tflane_jax.ablations.effects import effects, judged_claims
-from tflane_jax.ablations.findings import findings, save_effects
+from tflane_jax.ablations.effects import DIFFERENCE, Effect, effects, judged_claims
+from tflane_jax.ablations.findings import findings, save_effects, sentence
 from tflane_jax.ablations.results import Results
 from tflane_jax.datasets.tusimple import SOURCE as TUSIMPLE
 
@@ -111,3 +111,15 @@ def test_runs_without_a_best_checkpoint_are_no_interim_look(tmp_path):
         results, Declared(declared, SEEDS, "now", 0), "", judged_claims(results, declared, ""), tmp_path / "x"
     )
     assert "Interim" not in path.read_text()
+
+
+def test_distances_are_metres_in_sentences():
+    def effect(measure):
+        claim, numbers = Claim("a", "b"), {"p": 0.01, "p_holm": 0.02, "better": 2, "seeds": (0, 1), "finding": "shown"}
+        spread = {"low": -0.2, "high": -0.1, "seeds_low": -0.3, "seeds_high": 0.0}
+        return Effect(measure, "last", claim, "b", mean=0.8, std=0.1, difference=-0.12, **spread, **numbers)
+
+    names = ("all/AE_dist", "negative control clear/AE_dist", DIFFERENCE, "secondary measure all/mAP")
+    said = sentence([effect(name) for name in names])
+    assert said.count("-0.12 m (95 % -0.20 to -0.10, ") == 3
+    assert said.count("-12.00 points (95 % -20.00 to -10.00, ") == 1

@@ -130,6 +130,7 @@ def test_lanes_are_in_order_where_the_outer_one_leaves_the_image_higher_up():
     slopes = np.array([3.0, -0.4, -3.0, 0.8, 8.0])
     ends = np.minimum(0.4 + 0.5 / np.abs(slopes), 0.98)
     lanes = np.zeros((5, 8))
+    ends[4] = 0.4 + 0.49 / slopes[4]
     lanes[:, 0], lanes[:, 1], lanes[:, 6], lanes[:, 5] = 0.45, ends, slopes, 0.5 - 0.4 * slopes
     assert order_from_left(lanes).tolist() == [2, 1, 3, 0, 4]
     assert np.argsort(0.5 + slopes * (ends - 0.4), kind="stable").tolist() != [2, 1, 3, 0, 4]  # at their own lower ends

@@ -32,3 +32,13 @@ def test_bands_and_seeds_are_explained(tmp_path, monkeypatch, values):
     (legend,) = saved[0].legends
     assert [text.get_text() for text in legend.get_texts()] == ["gated (2 seeds)", "hard (1 seed)"]
     assert "one standard deviation" in legend.get_title().get_text()
+
+
+def test_values_are_joined_in_order_and_distances_are_metres(tmp_path, monkeypatch):
+    saved, savefig = [], Figure.savefig
+    monkeypatch.setattr(Figure, "savefig", lambda self, *a, **k: (saved.append(self), savefig(self, *a, **k)))
+    scores = {"model": [[{"all/AE_dist": value}] for value in (0.8, 1.2, 0.9)]}
+    save_sweep(tmp_path / "sweep.png", scores, "data.world.severity", ("0", "1", "0.5"), ["all/AE_dist"])
+    (ax,) = saved[0].axes
+    assert ax.get_title(loc="left") == "AE_dist, m"
+    np.testing.assert_allclose(ax.lines[0].get_xydata(), [[0, 0.8], [0.5, 0.9], [1, 1.2]])

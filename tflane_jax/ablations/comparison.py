@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from tflane_jax.ablations.statistics import holm, paired_difference
-from tflane_jax.metrics.directions import ERRORS, lower_is_better
+from tflane_jax.metrics.directions import ERRORS, lower_is_better, unit_of
 
 Scores = dict[str, float]
 """Metrics by "group/name", as `evaluation.results.Evaluation.scores` returns them."""
@@ -53,7 +53,9 @@ def shared_seeds(one: Mapping[int, Scores], other: Mapping[int, Scores]) -> list
 
 
 def compact(rows: Mapping[str, Collection[Scores]], metrics: Sequence[str]) -> list[dict[str, str]]:
-    """Return one row for each variant with "mean ± std" in percent, as papers print tables; "n/a" if one is NaN.
+    """Return one row for each variant with "mean ± std" as papers print tables; "n/a" if one is NaN.
+
+    Numbers are in percent; those of distances have their unit beside them.
 
     Args:
         rows: scores of each variant, one for each seed.
@@ -63,9 +65,11 @@ def compact(rows: Mapping[str, Collection[Scores]], metrics: Sequence[str]) -> l
     for name, scores in rows.items():
         row = {"model": name}
         for metric in metrics:
-            values = 100.0 * _column(scores, metric)
-            spread = f" ± {values.std(ddof=1):.1f}" if len(values) > 1 else ""
-            row[metric] = f"{values.mean():.1f}{spread}" if np.isfinite(values).all() else "n/a"
+            factor, unit = unit_of(metric)
+            digits, mark = (1, "") if unit == "percent" else (2, f" {unit}")
+            values = factor * _column(scores, metric)
+            spread = f" ± {values.std(ddof=1):.{digits}f}" if len(values) > 1 else ""
+            row[metric] = f"{values.mean():.{digits}f}{spread}{mark}" if np.isfinite(values).all() else "n/a"
         found.append(row)
     return found
 

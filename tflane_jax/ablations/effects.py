@@ -34,6 +34,8 @@ from tflane_jax.metrics.directions import ERRORS, lower_is_better
 
 SAMPLES = 10_000
 Finding = Literal["shown", "not shown", "contradicted", "not tested"]
+DIFFERENCE = "difference of the two"
+"""Name of the measure that is primary measure minus negative control."""
 
 
 @dataclass(frozen=True)
@@ -131,7 +133,7 @@ def measures(declaration: Declaration, errors: Collection[str] = ERRORS) -> tupl
     if control is not None:
         found.append(Measure(f"negative control {control}", {control: 1.0}))
         alike = lower_is_better(primary, errors) == lower_is_better(control, errors)
-        found.append(Measure("difference of the two", {primary: 1.0, control: -1.0 if alike else 1.0}))
+        found.append(Measure(DIFFERENCE, {primary: 1.0, control: -1.0 if alike else 1.0}))
     if secondary is not None:
         found.append(Measure(f"secondary measure {secondary}", {secondary: 1.0}))
     return tuple(found)

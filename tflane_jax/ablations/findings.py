@@ -10,10 +10,11 @@ from pathlib import Path
 from typing import Any
 
 from tflane_jax.ablations.declaration import Claim, Declaration, Declared
-from tflane_jax.ablations.effects import SAMPLES, Effect, Tested, Untested, measures, std, values
+from tflane_jax.ablations.effects import DIFFERENCE, SAMPLES, Effect, Tested, Untested, measures, std, values
 from tflane_jax.ablations.report import listed
 from tflane_jax.ablations.results import Results
 from tflane_jax.evaluation.by_scene import SAMPLES as SHARED_SAMPLES
+from tflane_jax.metrics.directions import unit_of
 from tflane_jax.plots.tables import format_table, save_table
 
 HAS_INTERVAL = "95 %"
@@ -41,7 +42,7 @@ def save_effects(
             f"{SAMPLES:,} bootstrap samples, {SHARED_SAMPLES} of scores that rank detections); seeds from, to: 95 %",
             "t interval over seeds. Neither is corrected for several claims. p: two-sided paired t-test over seeds;",
             "Holm: corrected for all differences of one measure and checkpoint. The table has fractions,",
-            "the sentences points: 0.01 is one point.",
+            "the sentences points: 0.01 is one point. Distances are in metres in both.",
         ]
         if no_drives:
             lines.append(f"Remark: {no_drives}: the intervals are too narrow.")
@@ -73,7 +74,10 @@ def sentence(of_row: Sequence[Effect]) -> str:
         text = f"**not tested** ({_why(primary)}): {claim.treatment} minus *{primary.row}* in {primary.measure}, "
     else:
         text = f"**{primary.finding}**: {claim.treatment} is better than *{primary.row}* in {primary.measure}, "
-    text = "; ".join([text + _numbers(primary), *(f"{_judged(each)}{_numbers(each)}" for each in others)])
+    # A difference of two scores has the unit of the first.
+    units = [primary.measure if each.measure == DIFFERENCE else each.measure for each in others]
+    more = (f"{_judged(each)}{_numbers(each, score)}" for each, score in zip(others, units, strict=True))
+    text = "; ".join([text + _numbers(primary, primary.measure), *more])
     return _with_claim(text, claim)
 
 
@@ -90,16 +94,22 @@ def _with_claim(text: str, claim: Claim) -> str:
     return f"{text}. Claim: {claim.text}" if claim.text else text
 
 
-def _numbers(effect: Effect) -> str:
-    """Return a difference in points of percent, with its uncertainties; those between seeds only if there are some."""
+def _numbers(effect: Effect, score: str) -> str:
+    """Return a difference in points of percent, or in metres, with its uncertainties.
+
+    Those between seeds are there only if there are several.
+    """
     if math.isnan(effect.difference):
         return "no number"
-    parts = [] if math.isnan(effect.low) else [f"{HAS_INTERVAL} {100 * effect.low:+.2f} to {100 * effect.high:+.2f}"]
+    factor, unit = unit_of(score)
+    unit = "points" if unit == "percent" else unit
+    low, high = factor * effect.low, factor * effect.high
+    parts = [] if math.isnan(effect.low) else [f"{HAS_INTERVAL} {low:+.2f} to {high:+.2f}"]
     if effect.finding == "not tested":
-        return " ".join([f"{100 * effect.difference:+.2f} points", *(f"({part})" for part in parts)])
+        return " ".join([f"{factor * effect.difference:+.2f} {unit}", *(f"({part})" for part in parts)])
     parts += [_p_value(effect.p_holm), f"better in {effect.better} of {len(effect.seeds)} seeds"]
     parts += [NO_INTERVAL] if math.isnan(effect.low) else []
-    return f"{100 * effect.difference:+.2f} points ({', '.join(parts)})"
+    return f"{factor * effect.difference:+.2f} {unit} ({', '.join(parts)})"
 
 
 def _p_value(p: float) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
@@ -92,8 +93,9 @@ class Evaluation:
         return dict(values) if whole else shown_of_part(values)
 
     def scores(self) -> dict[str, float]:
-        """Return the scores by "group/name", without counts."""
-        return self._named(self.groups)
+        """Return the scores by "group/name", without counts; NaN where a table shows none, see `shown`."""
+        shown = self.recorded()
+        return {name: shown.get(name, math.nan) for name in self._named(self.groups)}
 
     def recorded(self) -> dict[str, float]:
         """Return the scores that runs record and rate checkpoints by: those of `scores` that a table shows."""

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from tflane_jax.errors import UserError
-from tflane_jax.metrics.directions import lower_is_better
+from tflane_jax.metrics.directions import lower_is_better, unit_of
 from tflane_jax.plots import style
 from tflane_jax.plots.figure import columns_for, hide_unused, new_figure, save_figure
 from tflane_jax.plots.names import score_title
@@ -71,8 +71,8 @@ def save_comparison_curves(
 ) -> Path | None:
     """Write a panel for each score with a curve for each model: the mean over its runs, a band from least to most.
 
-    Scores are drawn in percent, as the tables show them. The legend says what lines and bands are, and how many runs a
-    model has.
+    Scores are drawn in percent, distances in metres, as the tables show them. The legend says what lines and bands
+    are, and how many runs a model has.
 
     Args:
         path: .png, .pdf or .svg.
@@ -89,7 +89,7 @@ def save_comparison_curves(
         for model, runs in found.items():
             if runs and all(("val", name) in run for run in runs):
                 steps, values = _joined([run["val", name] for run in runs])
-                panels.setdefault(name, {})[model] = steps, 100.0 * values
+                panels.setdefault(name, {})[model] = steps, unit_of(name)[0] * values
     if not panels:
         return None
     columns = columns_for(len(panels))
@@ -97,7 +97,7 @@ def save_comparison_curves(
     figure, axes = new_figure(-(-len(panels) // columns), columns, panel=size, footer=0.3 + 0.1 * len(found))
     styles = _styles(found)  # the same in all panels
     for ax, (name, series) in zip(axes.flat, panels.items(), strict=False):
-        ax.set_title(f"validation: {score_title(name)}, percent", fontsize=9, loc="left")
+        ax.set_title(f"validation: {score_title(name)}, {unit_of(name)[1]}", fontsize=9, loc="left")
         _draw_panel(ax, series, styles)
     hide_unused(axes, len(panels))
     lines = {str(line.get_label()): line for ax in axes.flat for line in ax.lines}

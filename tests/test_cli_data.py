@@ -16,7 +16,7 @@ def test_data_stats_counts_lanes_and_traffic(capsys):
     assert main(["data", "stats", "--data", "street", "--split", "val", "--count", "2"]) == 0
     printed = capsys.readouterr().out
     assert "street-val: 2 examples" in printed
-    rows = {line.split("|")[1].strip(): line.split("|")[2:-1] for line in printed.splitlines() if "|" in line}
+    rows = {line.split("|")[1].strip(): line.split("|")[3:-1] for line in printed.splitlines() if "|" in line}
     mean, low, _, high = map(float, rows["lanes"])
     assert 1.0 <= low <= mean <= high
     for quantity in (
@@ -33,7 +33,7 @@ def test_data_stats_counts_lanes_and_traffic(capsys):
 def test_data_stats_counts_map_lines(capsys):
     assert main(["data", "stats", "--config", "tf_lane/maptr:street", "--split", "val", "--count", "2"]) == 0
     printed = capsys.readouterr().out
-    rows = {line.split("|")[1].strip(): line.split("|")[2:-1] for line in printed.splitlines() if "|" in line}
+    rows = {line.split("|")[1].strip(): line.split("|")[3:-1] for line in printed.splitlines() if "|" in line}
     assert float(rows["lines, boundary"][0]) >= 1.0
     assert float(rows["metres of boundary"][0]) > 30.0
 
@@ -147,7 +147,7 @@ def test_distributions_of_several_data_are_laid_side_by_side(tmp_path, capsys):
     printed = capsys.readouterr().out
     for column in ("street (1 frames)", "real-maps (1 frames)", "street #2 (1 frames)"):
         assert column in printed
-    rows = {line.split("|")[1].strip(): line.split("|")[2:-1] for line in printed.splitlines() if "|" in line}
+    rows = {line.split("|")[1].strip(): line.split("|")[3:-1] for line in printed.splitlines() if "|" in line}
     for quantity in ("lanes", "connectors", "length, m", "curvature, 1/100 m", "visible fraction"):
         first, other, again = (cell.strip() for cell in rows[quantity])
         assert first == again

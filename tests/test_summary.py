@@ -6,12 +6,13 @@ from dataclasses import replace
 import pytest
 
 from tests.shared import ROOT
+from tflane_jax import summary
 from tflane_jax.cli import main
 from tflane_jax.config import load_config
 from tflane_jax.convert.hosts import camera_shapes
 from tflane_jax.models.camera_encoder import CameraEncoderConfig
 from tflane_jax.models.parameters import split_statistics
-from tflane_jax.summary import parameter_counts, prediction_program, shapes_of_params
+from tflane_jax.summary import parameter_counts, prediction_program, shapes_of_params, training_program
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 
 LSTR = ROOT / "configs" / "gtn_lane" / "lstr.py"
@@ -72,3 +73,18 @@ def test_the_marker_papers_full_size():
     ours, toponet = counts.values()
     assert sum(toponet.values()) == 62_812_675
     assert sum(ours.values()) == 66_716_163 == 62_812_675 + ours["marker_tokens"] + 3 * 263_680
+
+
+def test_a_batch_in_parts_is_planned_as_it_is_trained(monkeypatch):
+    config, forms = load_config("tf_lane/toponet"), []
+    task = replace(config.task, model=replace(config.task.model, decoder=replace(config.task.model.decoder, layers=1)))
+    make = summary.make_update_step
+    monkeypatch.setattr(
+        summary,
+        "make_update_step",
+        lambda *given: (forms.append(given[3].accumulate if given[3:] else 1), make(*given))[1],
+    )
+    example = task.shapes(config.data)
+    whole, parts = (training_program(task, example, 4, config.optim, accumulate=n, compiled=False) for n in (1, 4))
+    assert forms == [1, 4, 1]
+    assert (parts.batch, parts.gflop) == (4, whole.gflop)

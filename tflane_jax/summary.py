@@ -18,7 +18,7 @@ from tflane_jax.scene import shapes_of
 from tflane_jax.tasks.base import AnyTask
 from tflane_jax.training.schedule import OptimConfig, make_optimizer, scaled_to_batch
 from tflane_jax.training.state import init_state
-from tflane_jax.training.step import make_update_step
+from tflane_jax.training.step import UpdateForm, make_update_step
 
 MIB = 2**20
 
@@ -60,20 +60,26 @@ def prediction_program(task: AnyTask, example: Any, *, compiled: bool = True) ->
 
 
 def training_program(
-    task: AnyTask, example: Any, batch_size: int, optim: OptimConfig, *, compiled: bool = True
+    task: AnyTask, example: Any, batch_size: int, optim: OptimConfig, *, accumulate: int = 1, compiled: bool = True
 ) -> Program:
-    """Return the cost of an update: loss, gradient, optimiser, moving average; of clips if the task is one of clips."""
-    example, optim = training_shapes(task, example), scaled_to_batch(optim, batch_size)
+    """Return the cost of an update: loss, gradient, optimiser, moving average; of clips if the task is one of clips.
+
+    With `accumulate`, the batch passes in that many parts; operations are those of all of them.
+    """
+    shapes, optim = training_shapes(task, example), scaled_to_batch(optim, batch_size)
     steps = any_steps(optim)
-    optimizer, step = make_optimizer(optim, steps), make_update_step(task, optim, steps)
-    state = jax.eval_shape(partial(init_state, task, optimizer), jax.random.key(0), example)
-    lowered = jax.jit(step).lower(state, shapes_of(example, batch_size))
+    optimizer = make_optimizer(optim, steps)
+    step = make_update_step(task, optim, steps, UpdateForm(accumulate=accumulate))
+    state = jax.eval_shape(partial(init_state, task, optimizer), jax.random.key(0), shapes)
+    lowered = jax.jit(step).lower(state, shapes_of(shapes, batch_size))
     program = _program("training step", batch_size, lowered, compiled)
+    # XLA counts the operations of a loop once.
+    if accumulate > 1:
+        return replace(program, gflop=training_program(task, example, batch_size, optim, compiled=False).gflop)
     if not getattr(task, "loops", False):
         return program
-    # XLA counts the operations of a loop once.
     step = make_update_step(task.unrolled, optim, steps)
-    lowered = jax.jit(step).lower(state, shapes_of(example, batch_size))
+    lowered = jax.jit(step).lower(state, shapes_of(shapes, batch_size))
     return replace(program, gflop=_program(program.name, batch_size, lowered, False).gflop)
 
 

@@ -5,6 +5,8 @@ import json
 import pytest
 
 from tests.datasets.nuscenes_small import START, tables, write_nuscenes
+from tests.datasets.test_nuscenes import write_images
+from tflane_jax.datasets.nuscenes import SOURCE, NuScenesConfig
 from tflane_jax.datasets.nuscenes_check import check_nuscenes
 from tflane_jax.datasets.nuscenes_log import scene_frames, scene_tracks
 from tflane_jax.datasets.nuscenes_place import scene_files
@@ -295,3 +297,46 @@ def test_a_place_is_a_plain_name(tmp_path):
         found.location(found.scenes()["scene-0061"])
     with pytest.raises(UserError, match=r"location is '\.\./secret', expected the name of a city"):
         list(scene_files(root / "v1.0-mini" / "scene.json"))
+
+
+def test_a_scene_is_not_trained_on_and_tested(tmp_path):
+    file = tmp_path / "splits.json"
+    names = ["scene-0061", "scene-0103"]
+    file.write_text(json.dumps({"train": names[:1], "val": names[1:], "test": names[1:]}))
+    assert split_scenes(names, "test", mini=True, file=file) == ["scene-0103"]
+    file.write_text(json.dumps({"train": names, "val": names[1:]}))
+    for split in ("train", "val"):
+        with pytest.raises(UserError, match="scene-0103 is in train and in val: give each scene to one of them"):
+            split_scenes(names, split, mini=True, file=file)
+
+
+def test_scores_depend_on_the_scenes_that_a_file_of_splits_names(tmp_path):
+    file = tmp_path / "splits.json"
+    config, found = NuScenesConfig(tmp_path, split="test", splits=file), []
+    for scenes in (["a", "b"], ["b", "a"], ["b"]):
+        file.write_text(json.dumps({"test": scenes, "train": ["c"]}))
+        found.append(SOURCE.content(config))
+    assert found[0] == found[1] != found[2]
+    assert SOURCE.content(NuScenesConfig(tmp_path)) == ""
+
+
+def test_cameras_that_training_would_refuse_are_faults(tmp_path):
+    """Regression: images were only looked for, and calibrations not at all."""
+    write_images(tmp_path)
+    front = tmp_path / "samples" / "CAM_FRONT"
+    assert check_nuscenes(write_nuscenes(tmp_path)).faults == []
+    (front / "a1.jpg").write_text("no image")
+    (front / "a2.jpg").write_bytes((front / "a3.jpg").read_bytes()[:-40])
+    write_images(tmp_path / "small", size=(32, 36))
+    (tmp_path / "small" / "samples" / "CAM_FRONT" / "b0.jpg").replace(front / "b0.jpg")
+    assert check_nuscenes(tmp_path).faults == [
+        f"scene-0061: {front / 'a1.jpg'} is damaged or cut short (2 images of the scene)",
+        f"scene-0103: {front / 'b0.jpg'} is 32 x 36 pixels, 64 x 36 in the tables",
+    ]
+    content = tables()
+    content["calibrated_sensor"][1]["camera_intrinsic"] = [[0.0] * 3] * 3
+    content["sample_data"][4]["width"] = 32
+    said = check_nuscenes(write_nuscenes(tmp_path, content)).faults
+    assert "images of CAM_FRONT are 32 x 36 pixels here and 64 x 36 before" in said[0]
+    assert [fault.partition(":")[0] for fault in said[1:]] == ["scene-0061", "scene-0103"]
+    assert all("camera_intrinsic is no camera matrix" in fault for fault in said[1:])

@@ -9,10 +9,11 @@ from time import sleep
 import numpy as np
 import pytest
 
-from tests.datasets.nuscenes_small import PITCH, write_nuscenes
+from tests.datasets.nuscenes_small import PITCH, tables, write_nuscenes
 from tests.datasets.small_argoverse2 import write_log
 from tflane_jax.datasets import nuscenes_tracks, openlane_tracks
 from tflane_jax.datasets.examples import traffic_flow
+from tflane_jax.datasets.nuscenes import NuScenesConfig, NuScenesDataset
 from tflane_jax.datasets.nuscenes_log import level_poses
 from tflane_jax.datasets.nuscenes_tracks import SceneTracks
 from tflane_jax.datasets.openlane_tracks import SourceTracks
@@ -72,3 +73,21 @@ def test_threads_read_a_log_once_and_a_copy_for_a_worker_keeps_none(tmp_path, mo
     assert (len(made), {id(log) for log in logs}) == (1, {id(logs[0])})
     assert len(pickle.dumps(tracks)) == before
     assert pickle.loads(pickle.dumps(tracks))._logs.log(name).name == name
+
+
+def test_a_missing_key_frame_is_an_empty_frame(tmp_path):
+    """The last sample comes 1 s late: two frames are missing, and the history counts half seconds."""
+    content = tables()
+    for row in content["sample"]:
+        row["timestamp"] += 1_000_000 * (row["token"] == "sample-a3")
+    sound, late = (
+        NuScenesDataset(NuScenesConfig(write_nuscenes(tmp_path / name, each), split="train")).log("scene-0061")
+        for name, each in (("sound", tables()), ("late", content))
+    )
+    assert [moment.track_frame for moment in sound.keyframes] == [0, 1, 2, 3]
+    assert [moment.track_frame for moment in late.keyframes] == [0, 1, 2, 5]
+    np.testing.assert_allclose(np.diff(late.timestamps_ns) / 1e9, 0.5, atol=1e-3)
+    assert late.actors is late.tracks
+    assert sound.tracks.valid[:3].any(1).all()
+    seen = [traffic_flow(log, 3, history=3, capacity=4)[0].valid.any(0).tolist() for log in (sound, late)]
+    assert seen == [[True, True, True], [True, False, False]]

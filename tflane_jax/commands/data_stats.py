@@ -36,11 +36,13 @@ def stats(options: argparse.Namespace, overrides: Sequence[str]) -> int:
     if not indices:
         raise UserError(f"nothing to count: {dataset.name} has {len(dataset)} examples, {options.count} asked for")
     counted = [example_stats(dataset.example(index), source.example) for index in indices]
-    rows = [_row(name, np.array([one[name] for one in counted if name in one])) for name in counted[0] | counted[-1]]
+    names = dict.fromkeys(name for one in counted for name in one)
+    rows = [_row(name, np.array([one[name] for one in counted if name in one])) for name in names]
     print(format_table(rows, title=f"{data_name(source, options)}: {len(indices)} examples"))
     return 0
 
 
 def _row(quantity: str, values: np.ndarray) -> dict[str, Any]:
     low, middle, high = np.quantile(values.astype(float), (0.1, 0.5, 0.9))
-    return {"quantity": quantity, "mean": values.mean(), "10 %": low, "median": middle, "90 %": high}
+    row = {"quantity": quantity, "examples": len(values), "mean": values.mean()}
+    return row | {"10 %": low, "median": middle, "90 %": high}

@@ -44,11 +44,12 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> int:
     title = f"Parameters of {options.config or 'the default configuration'}"
     print(format_table(parts, title=title), flush=True)
 
-    batch_size = config.training.batch_size
+    batch_size, accumulate = config.training.batch_size, config.training.accumulate
     compiled = not options.no_compile
     programs = [prediction_program(config.task, example, compiled=compiled)]
     if not options.no_training:
-        programs.append(training_program(config.task, example, batch_size, config.optim, compiled=compiled))
+        how: dict[str, Any] = {"accumulate": accumulate, "compiled": compiled}
+        programs.append(training_program(config.task, example, batch_size, config.optim, **how))
     rows = [
         {
             "program": each.name,

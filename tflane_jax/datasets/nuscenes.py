@@ -8,6 +8,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass, replace
 from functools import cached_property
@@ -42,7 +44,7 @@ from tflane_jax.datasets.nuscenes_log import (
 )
 from tflane_jax.datasets.nuscenes_map import MapExpansion, read_expansion
 from tflane_jax.datasets.nuscenes_scenes import NUSCENES_SIZES
-from tflane_jax.datasets.nuscenes_splits import split_scenes
+from tflane_jax.datasets.nuscenes_splits import listed_scenes, split_scenes
 from tflane_jax.datasets.nuscenes_tables import find_tables, shared_tables
 from tflane_jax.datasets.openlane_example import camera_views, empty_views
 from tflane_jax.datasets.openlane_frames import SUBSETS, FrameCamera
@@ -289,6 +291,14 @@ def _views(config: NuScenesConfig, numbers: Sequence[int]) -> list[CameraViews |
     return [dataset.views(number) for number in numbers]
 
 
+def _content(config: NuScenesConfig) -> str:
+    """Return the hash of the scenes that a file of splits names; the tables are too large to be read for it."""
+    if config.splits is None:
+        return ""
+    names = sorted(listed_scenes(config.splits, config.split))
+    return hashlib.sha256(json.dumps(names).encode()).hexdigest()
+
+
 def _sample(config: NuScenesConfig) -> Example:
     return NuScenesDataset(config).example(0) if Path(config.root).is_dir() else nominal_example(config)
 
@@ -310,4 +320,5 @@ SOURCE = DataSource(
     interval=lambda config: 0.5,
     cameras=lambda config: None if config.image is None else CAMERAS,
     tracks_hz=lambda config: 2.0,
+    content=_content,
 )

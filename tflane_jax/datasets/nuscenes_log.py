@@ -50,6 +50,9 @@ Visibility = Literal["v0-40", "v40-60", "v60-80", "v80-100"]
 VISIBILITY: tuple[Visibility, ...] = ("v0-40", "v40-60", "v60-80", "v80-100")
 """Levels of the table `visibility`: percent of an object that the six cameras see together."""
 
+# Frames of a gap at most: nothing looks back farther.
+_LONGEST_GAP = 200
+
 
 @dataclass(frozen=True)
 class SceneFrames:
@@ -139,7 +142,7 @@ def scene_log(
         where = f"{scene['name']} on the map of {tables.location(scene)}"
         check_place(lanes, frames.global_from_frame[:, :2, 3], where)
     tracks = scene_tracks(tables, frames, CATEGORIES, least_visibility)
-    return Log(
+    log = Log(
         name=scene["name"],
         source="nuscenes",
         map=VectorMap({}) if vector_map is None else replace(vector_map, side=side_of(tables.location(scene))),
@@ -150,6 +153,41 @@ def scene_log(
         keyframes=key_frames(frames),
         seed=zlib.crc32(scene["name"].encode()),
         area=tables.location(scene),
+    )
+    return with_gaps(log)
+
+
+def with_gaps(log: Log) -> Log:
+    """Return a log with empty track frames where frames are missing, so that a number of frames is a time.
+
+    A gap is an interval of more than 1.5 times the median. The empty frames have the pose before the gap; those of a
+    long gap are as many as fill the longest history of a model.
+    """
+    interval = np.diff(log.timestamps_ns)
+    usual = float(np.median(interval)) if len(interval) else 0.0
+    missing = np.where(interval > 1.5 * usual, np.round(interval / max(usual, 1.0)) - 1, 0)
+    if not missing.any():
+        return log
+    place = np.concatenate([[0], np.cumsum(np.minimum(missing, _LONGEST_GAP).astype(int) + 1)])
+    number = np.arange(place[-1] + 1)
+    before = np.searchsorted(place, number, side="right") - 1
+    known, found = np.isin(number, place), log.tracks
+    tracks = replace(
+        found,
+        position=found.position[before],
+        yaw=found.yaw[before],
+        occluded=found.occluded[before],
+        valid=found.valid[before] & known[:, None],
+    )
+    first = log.timestamps_ns[0]
+    times = np.interp(number, place, (log.timestamps_ns - first).astype(float))
+    return replace(
+        log,
+        timestamps_ns=first + np.round(times).astype(np.int64),
+        global_from_ego=log.global_from_ego[before],
+        tracks=tracks,
+        actors=tracks,
+        keyframes=tuple(replace(moment, track_frame=int(place[moment.track_frame])) for moment in log.keyframes),
     )
 
 

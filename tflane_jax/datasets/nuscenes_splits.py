@@ -68,13 +68,15 @@ def split_scenes(
         misplaced: what becomes of `MISPLACED` scenes.
 
     Raises:
-        UserError: the file is malformed, lacks the split or names a scene that the tables lack; or the split is empty.
+        UserError: the file is malformed, lacks the split, names a scene that the tables lack or one of the training
+            split in another one; or the split is empty.
     """
     names = sorted(names)
     if file is None:
         found = [name for name in names if official_split(name, mini=mini) == split]
     else:
-        found = sorted(_listed(file, split))
+        found = sorted(listed_scenes(file, split))
+        _check_apart(file)
         if missing := set(found) - set(names):
             raise UserError(f"{file}: split {split} names {min(missing)}, which the tables do not have")
     if misplaced == "drop":
@@ -90,8 +92,18 @@ def split_scenes(
     return found
 
 
-def _listed(file: Path, split: Split) -> Sequence[str]:
+def listed_scenes(file: Path, split: Split) -> Sequence[str]:
+    """Return the scenes of a split as a file lists them; raises UserError for a file that does not."""
     scenes = items(load_json(Path(file)), split, str(file))
     if not all(isinstance(scene, str) for scene in scenes) or len(set(scenes)) != len(scenes):
         raise UserError(f"{file}: split {split} must be a list of different scene names")
     return scenes
+
+
+def _check_apart(file: Path) -> None:
+    """Raise UserError where a scene is trained on and tested; validation and test split may be the same."""
+    content = load_json(Path(file))
+    lists = {split: listed_scenes(file, split) for split in SPLITS if split in content}
+    for split in lists.keys() - {"train"}:
+        if both := set(lists.get("train", ())) & set(lists[split]):
+            raise UserError(f"{file}: {min(both)} is in train and in {split}: give each scene to one of them")

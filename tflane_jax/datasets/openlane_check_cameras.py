@@ -57,7 +57,7 @@ class CameraChecks:
         for camera in frame.cameras:
             if camera is None:
                 continue
-            fault = _damage(camera.image, self._images)
+            fault = damage_of(camera.image, self._images)
             size = None if fault else image_size(camera.image)
             intact += fault is None
             faults += [] if fault is None else [f"{camera.image} {fault}"]
@@ -135,8 +135,8 @@ def _jpeg_size(file: IO[bytes]) -> tuple[int, int] | None:
     return None
 
 
-def _damage(path: Path, images: Images) -> str | None:
-    """Return the fault of an image file, or None."""
+def damage_of(path: Path, images: Images) -> str | None:
+    """Return the fault of an image file, after its name; None for none. Its end is read, or the whole file."""
     if fault := unreadable(path):
         return f"cannot be read ({fault})"
     try:

@@ -100,17 +100,33 @@ def test_a_model_has_one_colour_in_all_panels(tmp_path, figures):
     save_comparison_curves(tmp_path / "curves.png", {"segments": segments, "lanes": lanes}, ["a", "b"])
     first, second = figures[0].axes
     assert second.get_title(loc="left") == "validation: b, percent"
-    np.testing.assert_allclose(second.lines[1].get_ydata(), [0.1])
+    np.testing.assert_allclose(second.lines[1].get_ydata(), [0.1, 0.1])
     colours = {line.get_label(): line.get_color() for line in second.lines}
     assert len(set(colours.values())) == 2
     assert first.lines[0].get_color() == colours["lanes"]
     (legend,) = figures[0].legends
-    assert legend.get_title().get_text() == bands("runs")
+    assert legend.get_title().get_text() == "bar: mean; points: runs"
     texts = [text.get_text() for text in legend.get_texts()]
     assert sorted(texts) == ["lanes (1 run)", "segments (1 run)"]
     shown = dict(zip([text.partition(" (")[0] for text in texts], legend.get_lines(), strict=True))
     assert {name: line.get_color() for name, line in shown.items()} == colours
     assert legend.get_window_extent().y1 <= second.get_window_extent().y0
+
+
+@pytest.mark.parametrize("steps", [(5,), (5, 9)])
+def test_models_that_were_validated_once_are_points_and_not_curves(tmp_path, figures, steps):
+    def run(value):
+        return [{"split": "val", "step": step, "all/recall": value} for step in steps]
+
+    save_comparison_curves(tmp_path / "curves.png", {"a": [run(0.2), run(0.4)], "b": [run(0.5)]}, ["all/recall"])
+    (ax,), (legend,) = figures[0].axes, figures[0].legends
+    once = len(steps) == 1
+    assert ax.get_xlabel() == ("after 5 steps" if once else "step")
+    assert legend.get_title().get_text() == ("bar: mean; points: runs" if once else bands("runs"))
+    np.testing.assert_allclose([line.get_ydata()[0] for line in ax.lines], [30.0, 50.0])
+    if once:
+        points = [collection.get_offsets().tolist() for collection in ax.collections]
+        np.testing.assert_allclose(points[0] + points[1], [[0, 20], [0, 40], [1, 50]])
 
 
 def test_more_models_than_colours_are_told_apart_by_their_lines(tmp_path, figures):

@@ -71,6 +71,8 @@ def save_comparison_curves(
 ) -> Path | None:
     """Write a panel for each score with a curve for each model: the mean over its runs, a band from least to most.
 
+    Where every model was validated once, at the same step, each run is a point beside the mean of its model instead.
+
     Scores are drawn in percent, distances in metres, as the tables show them. The legend says what lines and bands
     are, and how many runs a model has.
 
@@ -88,24 +90,27 @@ def save_comparison_curves(
     for name in names:
         for model, runs in found.items():
             if runs and all(("val", name) in run for run in runs):
-                steps, values = _joined([run["val", name] for run in runs])
-                panels.setdefault(name, {})[model] = steps, unit_of(name)[0] * values
+                validated, values = _joined([run["val", name] for run in runs])
+                panels.setdefault(name, {})[model] = validated, unit_of(name)[0] * values
     if not panels:
         return None
     columns = columns_for(len(panels))
     size = (3.7, 2.7)  # three fit beside each other on a page whose text can still be read
     figure, axes = new_figure(-(-len(panels) // columns), columns, panel=size, footer=0.3 + 0.1 * len(found))
     styles = _styles(found)  # the same in all panels
+    steps = {tuple(steps.tolist()) for series in panels.values() for steps, _ in series.values()}
+    once = len(steps) == 1 and len(steps.pop()) == 1
+    draw = _draw_points if once else _draw_panel
     for ax, (name, series) in zip(axes.flat, panels.items(), strict=False):
         ax.set_title(f"validation: {score_title(name)}, {unit_of(name)[1]}", fontsize=9, loc="left")
-        _draw_panel(ax, series, styles)
+        draw(ax, series, styles)
     hide_unused(axes, len(panels))
     lines = {str(line.get_label()): line for ax in axes.flat for line in ax.lines}
     number = {model: values.shape[1] for series in panels.values() for model, (_, values) in series.items()}
     figure.legend(
         lines.values(),
         [f"{model} ({counted(number[model], 'run')})" for model in lines],
-        title=bands("runs"),
+        title="bar: mean; points: runs" if once else bands("runs"),
         loc="outside lower center",
         ncols=min(len(lines), 2),
         fontsize=8,
@@ -158,6 +163,21 @@ def curves(records: Iterable[Mapping[str, Any]]) -> dict[tuple[str, str], Series
 
 def _styles(names: Iterable[str]) -> dict[str, dict[str, Any]]:
     return {name: style.curve_style(number) for number, name in enumerate(names)}
+
+
+def _draw_points(ax: Axes, series: Mapping[str, Series], styles: Mapping[str, Mapping[str, Any]]) -> None:
+    """Draw the runs of each model in a column of its own, with a bar at their mean; all are of one step."""
+    for column, name in enumerate(styles):
+        if name in series:
+            values = series[name][1]
+            ax.plot([column - 0.3, column + 0.3], [values.mean()] * 2, **styles[name], lw=2.4, label=name)
+            ax.scatter(np.full(values.size, column), values, color=styles[name]["color"], s=14, alpha=0.6, linewidths=0)
+    (step,) = next(iter(series.values()))[0].tolist()
+    ax.set_xlabel(f"after {step:,} steps", fontsize=8)
+    ax.set_xlim(-0.7, len(styles) - 0.3)
+    ax.set_xticks([])
+    ax.tick_params(labelsize=7)
+    ax.grid(alpha=0.3, lw=0.5, axis="y")
 
 
 def _draw_panel(

@@ -147,7 +147,7 @@ def test_distributions_of_several_data_are_laid_side_by_side(tmp_path, capsys):
     printed = capsys.readouterr().out
     for column in ("street (1 frames)", "real-maps (1 frames)", "street #2 (1 frames)"):
         assert column in printed
-    rows = {line.split("|")[1].strip(): line.split("|")[3:-1] for line in printed.splitlines() if "|" in line}
+    rows = {line.split("|")[1].strip(): line.split("|")[2:-1] for line in printed.splitlines() if "|" in line}
     for quantity in ("lanes", "connectors", "length, m", "curvature, 1/100 m", "visible fraction"):
         first, other, again = (cell.strip() for cell in rows[quantity])
         assert first == again

@@ -225,7 +225,7 @@ def _write_picture(
     cv2 = opencv()
     image = np.ascontiguousarray(photo)
     width, taken = max(1, round(max(image.shape) / 900)), []
-    font = cv2.FONT_HERSHEY_SIMPLEX, 0.5 * width
+    font = cv2.FONT_HERSHEY_SIMPLEX, 0.5 * width, width
 
     def fixed(pixels: np.ndarray) -> np.ndarray:
         return np.round((np.clip(pixels, -8000.0, 8000.0) - 0.5) * 16).astype(np.int32)
@@ -243,19 +243,20 @@ def _write_picture(
         words = f"{found.marker_id[k]}: {np.linalg.norm(pose[:2, 3]):.1f} m, {found.score[k]:.2f}"
         words += ", contradictory" if found.contradictory[k] else ""
         board = marker_outline(pose, board_size(family, size), intrinsics, camera_from_ego)
-        text = cv2.getTextSize(words, *font, width)[0]
-        place = _label_place(board, text, image.shape[1::-1], 4 * width, taken)
-        taken.append((place[0], place[1] - text[1], place[0] + text[0], place[1]))
-        # A dark edge, so that it can be read on the sky and on paint.
-        for ink, thickness in ((_DARK, 4 * width), (colour, width)):
-            cv2.putText(image, words, place, *font, ink, thickness, cv2.LINE_AA)
+        (across, high), low = cv2.getTextSize(words, *font)
+        left, bottom = _label_place(board, (across, high + low), image.shape[1::-1], 4 * width, taken)
+        taken.append((left, bottom - high - low, left + across, bottom))
+        # On dark ground it can be read on the sky and on paint. (A dark edge would be text of another thickness, which
+        # some versions of OpenCV space differently.)
+        cv2.rectangle(image, taken[-1][:2], taken[-1][2:], _DARK, cv2.FILLED)
+        cv2.putText(image, words, (left, bottom - low), font[0], font[1], colour, font[2], cv2.LINE_AA)
     write_bytes(path, cv2.imencode(".png", image[..., ::-1])[1].tobytes())
 
 
 def _label_place(
     board: Float[np.ndarray, "4 2"], text: tuple[int, int], size: tuple[int, int], gap: int, taken: Sequence[Box]
 ) -> tuple[int, int]:
-    """Return the lower left corner of a label in the picture, beside the labels whose boxes are `taken`.
+    """Return the lower left corner of a label's box in the picture, beside the labels whose boxes are `taken`.
 
     It is below the board, above it where there is no room, and further down or up where another label is.
     """

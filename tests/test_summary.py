@@ -14,7 +14,9 @@ from tflane_jax.models.camera_encoder import CameraEncoderConfig
 from tflane_jax.models.parameters import split_statistics
 from tflane_jax.summary import parameter_counts, prediction_program, shapes_of_params, training_program
 from tflane_jax.tasks.lane_graph import LaneGraphTask
+from tflane_jax.training.step import UpdateForm
 
+WHOLE = UpdateForm()
 LSTR = ROOT / "configs" / "gtn_lane" / "lstr.py"
 
 
@@ -79,11 +81,12 @@ def test_a_batch_in_parts_is_planned_as_it_is_trained(monkeypatch):
     config, forms = load_config("tf_lane/toponet"), []
     task = replace(config.task, model=replace(config.task.model, decoder=replace(config.task.model.decoder, layers=1)))
     make = summary.make_update_step
-    monkeypatch.setattr(
-        summary,
-        "make_update_step",
-        lambda *given: (forms.append(given[3].accumulate if given[3:] else 1), make(*given))[1],
-    )
+
+    def recording(task, optim, steps, form=WHOLE):
+        forms.append(form.accumulate)
+        return make(task, optim, steps, form)
+
+    monkeypatch.setattr(summary, "make_update_step", recording)
     example = task.shapes(config.data)
     whole, parts = (training_program(task, example, 4, config.optim, accumulate=n, compiled=False) for n in (1, 4))
     assert forms == [1, 4, 1]

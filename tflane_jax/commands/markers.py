@@ -34,14 +34,15 @@ from tflane_jax.markers.curves import CurveConfig, Sighting, measure, summarise
 from tflane_jax.markers.detection import DetectedMarkers, detect
 from tflane_jax.markers.image_search import DetectorConfig
 from tflane_jax.markers.square_pose import marker_outline
-from tflane_jax.plots import format_table, save_table
+from tflane_jax.plots import format_table, save_table, style
 from tflane_jax.plots.marker_curves import save_error_curves
+from tflane_jax.plots.marker_drive import OUTCOMES
 from tflane_jax.scene import CameraViews
 from tflane_jax.scene.marker_patterns import MarkerFamily, board_size
 from tflane_jax.world.render.camera import camera_pose
 
 _AXES = np.array([(255, 40, 40), (40, 200, 40), (60, 90, 255)])
-_OUTLINE, _CONTRADICTORY, _DARK = (255, 210, 0), (255, 59, 48), (27, 31, 39)
+_OUTLINE, _CONTRADICTORY, _DARK = (255, 210, 0), style.rgb(OUTCOMES["contradictory"]), style.rgb(style.ROAD)
 
 Box = tuple[int, int, int, int]
 

@@ -19,7 +19,14 @@ from jaxtyping import Float
 from tflane_jax.datasets.argoverse2_map import read_map
 from tflane_jax.datasets.log_frames import LogOutline
 from tflane_jax.datasets.openlane_splits import openlane_timestamps
-from tflane_jax.datasets.plausible import FARTHEST, check_distance, check_interval, check_motion, check_place
+from tflane_jax.datasets.plausible import (
+    FARTHEST,
+    check_distance,
+    check_interval,
+    check_motion,
+    check_place,
+    missing_frames,
+)
 from tflane_jax.errors import UserError
 from tflane_jax.files.feather_table import Kind, read_columns
 from tflane_jax.files.folders import named_folder
@@ -253,7 +260,7 @@ def _with_empty_frames(annotated: np.ndarray, folder: Path) -> np.ndarray:
             f"{folder / ANNOTATIONS} has no box for {steps.max() / 1e9:.0f} s after {annotated[steps.argmax()]}: are "
             "these several logs?"
         )
-    missing = np.rint(steps / np.median(steps)).astype(int) - 1
+    missing = missing_frames(annotated)
     between = [
         annotated[i] + steps[i] * np.arange(1, missing[i] + 1) // (missing[i] + 1) for i in np.flatnonzero(missing > 0)
     ]

@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, Int
 
 from tflane_jax.datasets.nuscenes_splits import MISPLACED
 from tflane_jax.datasets.nuscenes_tables import Row, Tables, poses_of, vectors
-from tflane_jax.datasets.plausible import check_distance, check_interval, check_motion, check_place
+from tflane_jax.datasets.plausible import check_distance, check_interval, check_motion, check_place, missing_frames
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import invert_pose, pose_yaw, relative_pose, transform_points, wrap_angle, yaw_pose
 from tflane_jax.scene import RoadUser
@@ -160,15 +160,12 @@ def scene_log(
 def with_gaps(log: Log) -> Log:
     """Return a log with empty track frames where frames are missing, so that a number of frames is a time.
 
-    A gap is an interval of more than 1.5 times the median. The empty frames have the pose before the gap; those of a
-    long gap are as many as fill the longest history of a model.
+    The empty frames have the pose before the gap (see `missing_frames`); there are at most as many as any history has.
     """
-    interval = np.diff(log.timestamps_ns)
-    usual = float(np.median(interval)) if len(interval) else 0.0
-    missing = np.where(interval > 1.5 * usual, np.round(interval / max(usual, 1.0)) - 1, 0)
+    missing = np.clip(missing_frames(log.timestamps_ns), 0, _LONGEST_GAP)
     if not missing.any():
         return log
-    place = np.concatenate([[0], np.cumsum(np.minimum(missing, _LONGEST_GAP).astype(int) + 1)])
+    place = np.concatenate([[0], np.cumsum(missing + 1)])
     number = np.arange(place[-1] + 1)
     before = np.searchsorted(place, number, side="right") - 1
     known, found = np.isin(number, place), log.tracks

@@ -44,6 +44,12 @@ def check_motion(position: Float[np.ndarray, "f d"], times_ns: Int[np.ndarray, "
         )
 
 
+def missing_frames(times_ns: Int[np.ndarray, " f"]) -> Int[np.ndarray, " f-1"]:
+    """Return how many frames are missing in each interval, by the median of all: some where it is 1.5 times as long."""
+    steps = np.diff(times_ns)
+    return np.rint(steps / np.median(steps)).astype(int) - 1 if len(steps) else steps
+
+
 def check_interval(times_ns: Int[np.ndarray, " f"], unit: str, where: str) -> None:
     """Raise UserError, which names the place, where the times of frames cannot be in the unit of their format.
 

@@ -98,8 +98,8 @@ def save_comparison_curves(
     size = (3.7, 2.7)  # three fit beside each other on a page whose text can still be read
     figure, axes = new_figure(-(-len(panels) // columns), columns, panel=size, footer=0.3 + 0.1 * len(found))
     styles = _styles(found)  # the same in all panels
-    steps = {tuple(steps.tolist()) for series in panels.values() for steps, _ in series.values()}
-    once = len(steps) == 1 and len(steps.pop()) == 1
+    schedules = {tuple(steps.tolist()) for series in panels.values() for steps, _ in series.values()}
+    once = [len(steps) for steps in schedules] == [1]
     draw = _draw_points if once else _draw_panel
     for ax, (name, series) in zip(axes.flat, panels.items(), strict=False):
         ax.set_title(f"validation: {score_title(name)}, {unit_of(name)[1]}", fontsize=9, loc="left")

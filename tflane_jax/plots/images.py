@@ -14,6 +14,7 @@ from tflane_jax.evaluation.lane_shapes import left_to_right
 from tflane_jax.files.images import opencv
 from tflane_jax.files.tusimple import ROWS, SIZE
 from tflane_jax.geometry.lane_shapes import curve_columns
+from tflane_jax.plots import style
 from tflane_jax.plots.figure import hide_unused, new_figure, save_figure
 from tflane_jax.scene import CurvePrediction, LaneLines, RoadImage, row_of
 
@@ -104,8 +105,7 @@ def lanes_drawn(
     cv2, drawn = opencv(), np.ascontiguousarray(photo).copy()
     width = max(2, round(photo.shape[1] / 300))
     for lane, colour in zip(lanes, itertools.cycle(LANE_COLOURS), strict=False):
-        rgb = tuple(int(colour[i : i + 2], 16) for i in (1, 3, 5))
-        cv2.polylines(drawn, [np.round(lane).astype(np.int32)], False, rgb, width, cv2.LINE_AA)
+        cv2.polylines(drawn, [np.round(lane).astype(np.int32)], False, style.rgb(colour), width, cv2.LINE_AA)
     return drawn
 
 

@@ -65,6 +65,12 @@ LIGHT = {1: "#ff3b30", 2: "#34c759", 3: "#ffcc00"}
 OTHER_ELEMENT = "#c8ccd4"
 
 
+def rgb(colour: str) -> tuple[int, int, int]:
+    """Return red, green and blue, 0 to 255, of a colour "#rrggbb", for drawing into images."""
+    red, green, blue = bytes.fromhex(colour[1:])
+    return red, green, blue
+
+
 def curve_style(number: int) -> dict[str, Any]:
     """Return colour and line style of a curve by its number; the colours come again with other lines."""
     return {

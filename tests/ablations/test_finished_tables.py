@@ -7,6 +7,7 @@ import pytest
 
 from tests.ablations.test_tables import small, stopped_at_the_third
 from tests.tiny_run import fakes  # noqa: F401 (a fixture that is used by itself)
+from tflane_jax.ablations.jobs import Job
 from tflane_jax.ablations.reuse import FILE, find_archives
 from tflane_jax.ablations.table_plan import plan_table
 from tflane_jax.ablations.table_run import run_table
@@ -74,6 +75,25 @@ def test_the_device_with_the_most_runs_is_taken(tiny, trained, monkeypatch):
     run_table(small(tiny), range(3), trained, finished=True)
     assert summary(trained)["devices"] == ["gpu: x"]
     assert summary(trained)["seeds"] == [0, 1, 2]
+
+
+@pytest.mark.parametrize(
+    ("gpu", "cpu", "taken"),
+    [
+        (["base, seed 0", "again, seed 0"], ["tfm, seed 0"], "gpu: x"),
+        (["base, seed 0", "base, seed 1", "again, seed 0"], ["base, seed 0", "tfm, seed 0"], None),
+        (["base, seed 0", "tfm, seed 1", "again, seed 0"], ["base, seed 1", "tfm, seed 1"], None),
+        (["base, seed 0", "tfm, seed 0", "again, seed 0"], ["base, seed 0", "tfm, seed 0"], "gpu: x"),
+    ],
+)
+def test_pairs_that_test_a_claim_count_before_runs(tiny, tmp_path, monkeypatch, gpu, cpu, taken):
+    """A table with more rows that no claim can compare says less."""
+    complete = {"gpu: x": gpu, None: cpu}
+    monkeypatch.setattr("tflane_jax.ablations.table_plan.worker_threads", lambda *_: {"cores": 1})
+    monkeypatch.setattr("tflane_jax.ablations.table_plan.settings_in", lambda _: [{"cores": 1, "device": "gpu: x"}])
+    monkeypatch.setattr(Job, "is_complete", lambda job: job.label in complete[job.threads.get("device")])
+    jobs = plan_table(small(tiny), range(2), tmp_path, finished=True).jobs
+    assert {job.threads.get("device") for of_row in jobs.values() for job in of_row} == {taken}
 
 
 @pytest.mark.slow

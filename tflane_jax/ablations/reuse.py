@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from tflane_jax.ablations.archive import Archive, merged, read_archive, write_archive
+from tflane_jax.ablations.declaration import Claim, Declaration, model_of_row
 from tflane_jax.ablations.facts import facts
 from tflane_jax.ablations.jobs import Job
 from tflane_jax.ablations.recorded import Measured, RecordedRun, evaluation_name
@@ -73,7 +74,7 @@ def thread_settings(archive: Archive, own: Mapping[str, Any]) -> list[Mapping[st
 
 
 def with_recorded(
-    plans: Sequence[Plan], archive: Archive, scores: Collection[str], *, finished: bool = False
+    plans: Sequence[Plan], archive: Archive, declaration: Declaration, *, finished: bool = False
 ) -> dict[str, list[Job]]:
     """Return the first plan with recorded runs in the place of trainings.
 
@@ -83,16 +84,17 @@ def with_recorded(
     Args:
         plans: the same trainings with different thread settings, that of this process first.
         archive: what is recorded.
-        scores: that a table cannot do without; a run that lacks one is trained.
+        declaration: what the table tests; a recorded run that lacks one of its scores is trained.
         finished: nothing is going to be trained, so that complete runs of any thread setting are taken; of several
-            devices, those of the one with the most.
+            devices, those of the one that tests the most: with the most pairs of runs for the claims, then the most
+            runs.
     """
 
     def best(same: Sequence[Job]) -> Job:
         def recorded(runs: Mapping[str, RecordedRun]) -> Iterator[Job]:
             for job in same:
                 run = runs.get(job.folder.name)
-                if run is not None and not _why_not(run, job, scores):
+                if run is not None and not _why_not(run, job, declaration.scores):
                     yield replace(job, recorded=run)
 
         # A run at hand can be measured for this table; what another one recorded has the parts by scene of its scores.
@@ -110,9 +112,19 @@ def with_recorded(
         by_device.setdefault(_device(next(iter(plan.values()))[0]), []).append(plan)
     of_each = (chosen(same) for same in by_device.values())  # that of this process first
     if finished:
-        return max(of_each, key=lambda found: sum(job.is_complete() for jobs in found.values() for job in jobs))
+        return max(of_each, key=lambda found: _tested(found, declaration.claims))
     found = chosen(plans)
     return found if len({_device(job) for jobs in found.values() for job in jobs}) == 1 else next(of_each)
+
+
+def _tested(plan: Plan, claims: Sequence[Claim]) -> tuple[int, int]:
+    """Return how many pairs of runs test a claim, and how many runs there are; of complete ones."""
+    complete = {name: [job.is_complete() for job in jobs] for name, jobs in plan.items()}
+    pairs = 0
+    for claim in claims:
+        rows = {model_of_row(row, complete) for row in (claim.treatment, claim.control) if row is not None}
+        pairs += sum(all(of_seed) for of_seed in zip(*(complete[row] for row in rows), strict=True))
+    return pairs, sum(map(sum, complete.values()))
 
 
 def _device(job: Job) -> Any:

@@ -12,6 +12,7 @@ from tests.tiny_run import CONFIG as TINY
 from tests.tiny_run import fakes  # noqa: F401 (a fixture that is used by itself)
 from tflane_jax.config import RunConfig, load_config
 from tflane_jax.config_io import to_json
+from tflane_jax.datasets.sources import source_of
 from tflane_jax.errors import UserError
 from tflane_jax.evaluation.lane_groups import LANE_GROUPS
 from tflane_jax.models.toponet import paper_config
@@ -85,6 +86,19 @@ def test_a_run_of_an_older_version_opens_and_resumes(config, tmp_path, capsys, m
     other = replace(config, optim=replace(config.optim, lr=1.0))
     with pytest.raises(UserError, match=r"another configuration \(optim\.lr: 0\.01 there, 1\.0 here\)"):
         train_run(other, folder, start="resume", progress=False)
+
+
+def test_a_run_is_not_resumed_after_its_files_were_edited(config, tmp_path, monkeypatch):
+    def edited(content):
+        given = replace(source_of(config.data.source("train")), content=lambda source: f"{content} {source.split}")
+        monkeypatch.setattr("tflane_jax.runs.source_of", lambda source: given)
+
+    edited("old")
+    train_run(config, tmp_path / "run", progress=False)
+    assert train_run(config, tmp_path / "run", start="resume", progress=False).step == 4
+    edited("new")
+    with pytest.raises(UserError, match="the files of its training data have changed since"):
+        train_run(config, tmp_path / "run", start="resume", progress=False)
 
 
 def test_a_configuration_that_was_edited_to_another_model_is_named(config, tmp_path, monkeypatch):

@@ -104,7 +104,9 @@ def train_run(
 def _train(config: RunConfig, folder: Path, *, start: Start, progress: bool, drawn: Drawn) -> TrainingResult:
     task = config.task
     with agreed(), stage("reading the training data"):
-        source: Any = task.training_form(config.data.source("train"), config.data)
+        train_split = config.data.source("train")
+        content = source_of(train_split).content(train_split)
+        source: Any = task.training_form(train_split, config.data)
         data: Any = task.load(source, progress=progress)
         task.check(config.data, data)
         arrays, prepare = task.examples(data), task.prepare(config.data)
@@ -130,6 +132,7 @@ def _train(config: RunConfig, folder: Path, *, start: Start, progress: bool, dra
         evaluate=evaluate,
         draw=_drawing(config, drawn),
         frozen=task.frozen,
+        content=content,
         progress=progress,
     )
 

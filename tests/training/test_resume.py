@@ -92,6 +92,27 @@ def test_a_run_is_not_resumed_on_another_number_of_examples(tmp_path):
     assert run(tmp_path / "run", start="resume", arrays=line_arrays(20)).step == 30
 
 
+def test_a_run_is_not_resumed_on_files_that_changed(tmp_path):
+    """As many scenes, but other ones: their number tells nothing."""
+    folder = tmp_path / "run"
+    run(folder, config=dataclasses.replace(CONFIG, steps=10), content="scenes a, b")
+    with pytest.raises(
+        UserError, match=r"run was trained on other scenes or maps: .* have changed since: restore them"
+    ):
+        run(folder, start="resume", content="scenes a, c")
+    assert run(folder, start="resume", content="scenes a, b").step == 30
+
+
+def test_a_run_of_an_earlier_version_knows_no_files(tmp_path):
+    folder = tmp_path / "run"
+    run(folder, config=dataclasses.replace(CONFIG, steps=10))
+    path = max((folder / "checkpoints").glob("*/manifest.json"))
+    manifest = json.loads(path.read_text())
+    del manifest["progress"]["content"]
+    path.write_text(json.dumps(manifest))
+    assert run(folder, start="resume", content="scenes a, b").step == 30
+
+
 def test_checkpoints_without_a_run_are_no_place_for_a_new_one(tmp_path):
     """Regression: those of the higher steps were kept, and the new run's were deleted."""
     folder = tmp_path / "run"

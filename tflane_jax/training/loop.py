@@ -34,7 +34,7 @@ from tflane_jax.training.notices import NO_BEST, due_notices, not_finite, print_
 from tflane_jax.training.provenance import add_provenance
 from tflane_jax.training.records import Record, RecordWriter, Unwritten, Window, by_name, read_records, seed_record
 from tflane_jax.training.restarts import adapt
-from tflane_jax.training.run_folder import CurrentForm, Start, check_unchanged, claimed
+from tflane_jax.training.run_folder import CurrentForm, Start, check_same_data, check_unchanged, claimed
 from tflane_jax.training.schedule import OptimConfig, make_optimizer, scaled_to_batch
 from tflane_jax.training.sharding import placed
 from tflane_jax.training.state import init_states, of_all_seeds, per_seed, state_of
@@ -131,6 +131,7 @@ def train(
     evaluate: Evaluate | None = None,
     draw: Draw | None = None,
     frozen: Sequence[str] = (),
+    content: str = "",
     progress: bool = True,
 ) -> TrainingResult:
     """Train a task and leave everything about the run in `folder`.
@@ -148,6 +149,7 @@ def train(
         prepare: augments every example, see `datasets.batches`.
         evaluate, draw: called at every evaluation.
         frozen: paths of modules that `init_from` must have, see `starting_params`.
+        content: hash of the files of the examples, which a resumed run must find unchanged; "" for none.
         progress: show a bar with rate and time left.
 
     Raises:
@@ -188,7 +190,7 @@ def train(
             states = init_states(task, optimizer, config.seeds, example)
         window, metrics, times = Window(), {}, StepTime()
         memories, started_from = [Memory() for _ in config.seeds], {}
-        examples, due = example_count(arrays), False
+        data, due = {"examples": example_count(arrays), "content": content}, False
         if start == "resume" and (latest := from_first(lambda: _latest(checkpoints))) is not None:
             whole = of_all_seeds(states)
             with stage(f"restoring step {latest['step']}"):
@@ -196,14 +198,10 @@ def train(
             states = per_seed(restored, config.seeds)
             try:
                 window, metrics, times.seconds, memories = _carried(latest["progress"], memories)
-                before, due = int(latest["progress"].get("examples", examples)), bool(latest["progress"].get("due"))
+                before, due = data | latest["progress"], bool(latest["progress"].get("due"))
             except WRONG_PROGRESS as error:
                 raise checkpoints.damaged_progress(latest["step"], error) from error
-            if before != examples:
-                raise UserError(
-                    f"{folder} was trained on {before} examples, and the training data have {examples} now: restore "
-                    "them, or start another run (from this one: training.init_from)"
-                )
+            check_same_data(folder, before, data)
         elif (origin := config.init_from) is not None:
             fresh = states
             with stage(f"reading {origin}"):
@@ -249,7 +247,7 @@ def train(
         # Steps
         # =============================================================================================================
         def save(evaluated: dict[str, float], **more: bool) -> None:
-            carried = {"window": asdict(window), "seconds": times.seconds, "metrics": metrics, "examples": examples}
+            carried = {"window": asdict(window), "seconds": times.seconds, "metrics": metrics} | data
             if adaptive is not None:
                 carried["cycles"] = [asdict(memory) for memory in memories]
             manifest = Manifest(step=step, config=resolved, metrics=evaluated, progress=carried | more)

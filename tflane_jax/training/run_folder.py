@@ -14,7 +14,7 @@ import contextlib
 import os
 import re
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -88,6 +88,17 @@ def check_unchanged(folder: Path, resolved: dict[str, Any], current_form: Curren
             f"{folder} was started with another configuration ({difference}): resume it as it is, or start another run"
         )
     return notices
+
+
+def check_same_data(folder: Path, before: Mapping[str, Any], now: Mapping[str, Any]) -> None:
+    """Raise UserError if a run was trained on another number of "examples", or on files with another "content"."""
+    if before["examples"] != now["examples"]:
+        change = f"was trained on {before['examples']} examples, and the training data have {now['examples']} now"
+    elif before["content"] != now["content"]:
+        change = "was trained on other scenes or maps: the files of its training data have changed since"
+    else:
+        return
+    raise UserError(f"{folder} {change}: restore them, or start another run (from this one: training.init_from)")
 
 
 def unused_changes(folder: Path, used: dict[str, Any], current_form: CurrentForm) -> list[str]:

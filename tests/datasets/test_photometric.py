@@ -61,14 +61,16 @@ def test_brightness_adds_and_contrast_multiplies():
     assert 1.25 < means.max() < 1.41
 
 
-@pytest.mark.parametrize("colour", [(180, 120, 90), (90, 60, 180), (180, 90, 95)])
+@pytest.mark.parametrize("colour", [(180, 120, 90), (90, 60, 180), (180, 90, 95), (200, 90, 80)])
 def test_saturation_and_hue_are_those_of_hsv(colour):
-    """The last colour lies next to the wrap-around of hue."""
-    pixel = np.array([[colour]], np.uint8)
-    hue, saturation, value = colorsys.rgb_to_hsv(*pixel[0, 0] / 255)
-    less = distorted(replace(ALWAYS, saturation=(0.5, 0.5)), image=pixel)[0, 0] / 255
+    """The last two colours lie on either side of the wrap-around of hue."""
+    row = np.full((1, 100, 3), colour, np.uint8)  # OpenCV has other code for long rows than for short ones
+    hue, saturation, value = colorsys.rgb_to_hsv(*row[0, 0] / 255)
+    less = distorted(replace(ALWAYS, saturation=(0.5, 0.5)), image=row)[0, 0] / 255
     np.testing.assert_allclose(colorsys.rgb_to_hsv(*less), (hue, saturation / 2, value), atol=0.01)
-    turned = [distorted(replace(ALWAYS, hue=18.0), seed, pixel)[0, 0] / 255 for seed in range(30)]
+    images = [distorted(replace(ALWAYS, hue=18.0), seed, row) for seed in range(30)]
+    assert all((image == image[0, 0]).all() for image in images)
+    turned = [image[0, 0] / 255 for image in images]
     hues = [(360 * (colorsys.rgb_to_hsv(*colour)[0] - hue) + 180) % 360 - 180 for colour in turned]
     assert -19 < min(hues) < -10
     assert 10 < max(hues) < 19

@@ -104,14 +104,21 @@ def test_lines_that_come_and_go_are_consistent_and_lines_that_jump_are_not():
     assert jumps["C-AP_divider"] < 0.7 * still["C-AP_divider"]
 
 
-def test_a_model_without_centerlines_is_measured_on_three_classes():
+@pytest.mark.parametrize("classes", [3, 4])
+def test_a_model_is_measured_on_its_classes(classes):
+    """Regression: the protocol was that of no frame, and never told of centerlines."""
     metrics = MapLineMetrics(labels=LABELS)
     for example in world()[:2]:
-        metrics.update(perfect(example.map_lines, classes=3), example)
+        metrics.update(perfect(example.map_lines, classes=classes), example)
     found = metrics.compute()["lines"]
-    assert "AP_centerline" not in found
-    assert "centerlines" not in metrics.protocol
+    assert ("AP_centerline" in found) == (classes == 4)
+    assert ("with centerlines" in metrics.protocol) == (classes == 4)
     assert found["recall"] == 1.0
+
+
+@pytest.mark.parametrize("labels", [(), ("visibility",)])
+def test_the_protocol_names_the_limit_of_groups_that_are_measured(labels):
+    assert ("occluded" in MapLineMetrics(labels=labels).protocol) == ("visibility" in labels)
 
 
 def test_a_model_with_heights_is_measured_with_them():

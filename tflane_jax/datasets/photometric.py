@@ -126,7 +126,8 @@ def distort(
         if changes[2]:
             colour[..., 1] = np.minimum(colour[..., 1] * np.float32(saturation), 1.0)
         if changes[3]:
-            colour[..., 0] += np.float32(hue)  # OpenCV wraps hue around; np.mod would take as long as all other steps
+            # OpenCV wraps hues above 360 degrees, but not negative ones; np.mod would take as long as all other steps.
+            colour[..., 0] += np.float32(hue % 360.0)
         out = cv2.cvtColor(colour, cv2.COLOR_HSV2RGB)
     if changes[1] and not early:
         out *= np.float32(contrast)

@@ -220,7 +220,11 @@ class GroupedMetrics:
     @property
     def protocol(self) -> str:
         """Name and version, the title of every table of these numbers."""
-        return self._empty.protocol + self.partition.suffix
+        return self._metrics.get("all", self._empty).protocol + self._suffix
+
+    @property
+    def _suffix(self) -> str:
+        return self.partition.suffix if self._metrics.keys() & set(self.partition.names) else ""
 
     def update(
         self,
@@ -274,7 +278,9 @@ class GroupedMetrics:
     def merge(self, *others: Self) -> Self:
         """Return an accumulator of the frames of all, in this order (none changes)."""
         for other in others:
-            if self.protocol != other.protocol or self._metrics.keys() != other._metrics.keys():
+            # Frames of either may lack a class that the protocol of the others names.
+            same = self._empty.protocol == other._empty.protocol and self._suffix == other._suffix
+            if not same or self._metrics.keys() != other._metrics.keys():
                 raise UserError(f"cannot merge metrics of {self.protocol} with {other.protocol}, or of other groups")
         every, merged = (self, *others), copy.copy(self)
         merged._metrics = {

@@ -75,6 +75,12 @@ def test_paths_are_paths(folders):
     assert find_weights(Path("lstr")) == (Path("lstr"), None)
 
 
+def test_a_folder_of_the_name_is_no_file(folders):
+    Path("lstr").mkdir()
+    (folders[0] / LSTR.files[0]).touch()
+    assert find_weights(Path("lstr")) == (folders[0] / LSTR.files[0], LSTR)
+
+
 def test_other_tensors_under_the_name_are_refused(folders):
     np.savez(folders[2] / "LSTR_500000.npz", **lstr_state())
     with pytest.raises(UserError, match=r"LSTR_500000.npz is not the published file: the sha256 of its tensors is"):

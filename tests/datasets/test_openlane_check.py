@@ -4,6 +4,7 @@ import json
 import pickle
 import re
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from tests.datasets.openlane_scenes import FRAMES, DriveConfig, DriveDataset
 from tflane_jax.cli import main
 from tflane_jax.datasets.openlane_check import check_openlane_v2
 from tflane_jax.datasets.openlane_export import export_openlane_v2
+from tflane_jax.datasets.openlane_frames import list_frames
 from tflane_jax.errors import UserError
 
 cv2 = pytest.importorskip("cv2")
@@ -106,6 +108,8 @@ def element(**entries):
         ("", lambda content: content["sensor"].update(CAM_ROOF={}), "camera 'CAM_ROOF' is none of subset B"),
         ("", annotate(topology_lclc=[[0, 1], [0, 0]]), r"topology_lclc has shape \(2, 2\), expected \(3, 3\)"),
         ("", annotate(topology_lcte=[[0, 2]] * 3), "topology_lcte holds 2, expected 0 and 1 only"),
+        ("", lambda c: c["annotation"]["lane_centerline"][0].update(points=[[5.0, 1.0, 0.0]] * 3), "has no length"),
+        ("-ls", lambda c: c["annotation"]["area"][0].update(points=[[5.0, 1.0, 0.0]]), "has no length"),
         ("", element(attribute=13), "attribute is 13, expected a whole number from 0 to 12"),
         ("", element(attribute=7), "attribute does not fit its category"),
         ("", element(points=[[14, 12], [10, 4]]), "box has no area"),
@@ -121,6 +125,24 @@ def test_a_damaged_frame_is_named(folder, suffix, function, said):
     found = check_openlane_v2(folder, progress=False)
     assert any(path in fault and re.search(said, fault) for fault in found.faults), found.faults
     assert found.rows[0]["faults"] == len(found.faults)
+
+
+def test_frames_that_are_named_in_another_unit_are_named(folder):
+    """Subset B counts microseconds: nanoseconds would not fit in 64 bits."""
+    path = Path(frame(folder, 1))
+    path.rename(path.with_name(f"{path.stem}000.json"))
+    (folder / "data_dict_subset_B.json").unlink()
+    said = "\n".join(check_openlane_v2(folder, progress=False).faults)
+    assert f"1 train frames, first train/01000/{path.stem}000: it has no whole number of microseconds" in said
+    with pytest.raises(UserError, match=rf"{path.stem}000 has no whole number of microseconds as its timestamp"):
+        list_frames(folder, "train", "B")
+
+
+@pytest.mark.parametrize("name", ["9" * 5000, "-5", "first"])
+def test_names_that_are_no_times_are_named(folder, name):
+    change(folder / "data_dict_subset_B.json", lambda content: content["train"]["01000"].append(f"{name}.json"))
+    (fault,) = check_openlane_v2(folder, progress=False).faults
+    assert f"{name} has no whole number as its timestamp" in fault
 
 
 def test_missing_and_damaged_files_are_named(folder):

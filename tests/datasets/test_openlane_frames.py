@@ -40,7 +40,7 @@ def test_a_folder_without_frames_is_none_of_openlane_v2(tmp_path):
 def test_frames_are_named_after_their_times(tmp_path, name):
     (tmp_path / "train" / "00000" / "info").mkdir(parents=True)
     (tmp_path / "train" / "00000" / "info" / f"{name}.json").touch()
-    with pytest.raises(UserError, match=rf"frame train/00000/{name} has no whole number as its timestamp"):
+    with pytest.raises(UserError, match=rf"frame train/00000/{name} has no whole number of nanoseconds as its"):
         list_frames(tmp_path, "train", "A")
 
 

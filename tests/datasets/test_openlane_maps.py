@@ -182,9 +182,15 @@ def _empty(frames):
         frame["annotation"] |= {"lane_segment": [], "topology_lsls": [], "topology_lste": []}
 
 
+def _zigzag(frames):
+    """A small file that would become hundreds of millions of points, 2 m apart."""
+    frames[1]["annotation"]["lane_segment"][0]["centerline"] = [[(-1) ** i * 9e4, 0.0, 0.0] for i in range(6000)]
+
+
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
+        (_zigzag, r"-ls\.json: a line is 1079820 km long, in a frame of some 100 m"),
         (_no_annotation, "has no annotation, as in the test split"),
         (_jump, "the vehicle is 3.. m from its place 0.5 s before"),
         (_not_a_number, r"lane_segment\[0\]\.centerline"),

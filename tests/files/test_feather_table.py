@@ -9,6 +9,19 @@ pyarrow = pytest.importorskip("pyarrow")
 feather = pytest.importorskip("pyarrow.feather")
 
 
+@pytest.mark.parametrize("kind", ["string", "large_string", "dictionary"])
+def test_a_long_text_is_refused(tmp_path, kind):
+    """Each of 20,000 texts would take as much memory as the longest, 7 GB in all."""
+    path = tmp_path / "annotations.feather"
+    column = pyarrow.array(["a"] * 20_000 + ["b" * 100_000])
+    column = column.dictionary_encode() if kind == "dictionary" else column.cast(kind)
+    feather.write_feather(pyarrow.table({"track_uuid": column}), path)
+    with pytest.raises(UserError, match="column track_uuid holds a text of 100000 characters"):
+        read_columns(path, {"track_uuid": "text"})
+    feather.write_feather(pyarrow.table({"track_uuid": column[:0]}), path)
+    assert read_columns(path, {"track_uuid": "text"})["track_uuid"].shape == (0,)
+
+
 @pytest.mark.parametrize("kind", ["text", "dictionary"])
 def test_one_flipped_bit_of_a_text_is_refused(tmp_path, kind):
     path = tmp_path / "annotations.feather"

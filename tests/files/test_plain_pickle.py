@@ -83,6 +83,28 @@ def test_the_size_that_an_array_claims_is_ignored(tmp_path):
     assert load_plain_pickle(tmp_path / "huge.pkl").size == 0
 
 
+@pytest.mark.parametrize(
+    "twice",
+    [lambda _: b"2\x86", lambda i: b"q" + bytes([i]) + b"h" + bytes([i]) + b"\x86"],
+    ids=["copied", "by number"],
+)
+def test_tuples_that_hold_each_other_twice_are_refused(tmp_path, twice):
+    """Hashing the last of fifty, the key of a mapping, would take years."""
+    file = tmp_path / "key.pkl"
+    file.write_bytes(b"\x80\x04})" + b"".join(map(twice, range(50))) + b"K\x01s.")
+    with pytest.raises(UserError, match=r"key\.pkl is .* damaged .*its tuples hold each other too many times"):
+        load_plain_pickle(file)
+    file.write_bytes(b"\x80\x04})" + b"".join(map(twice, range(10))) + b"K\x01s.")
+    assert list(load_plain_pickle(file).values()) == [1]
+
+
+def test_keys_that_stand_in_a_file_many_times_are_read(tmp_path):
+    key = ("val", ("10000", ("315", 7)))
+    content = [{(key, i): (key, [key, i])} for i in range(2000)]
+    (tmp_path / "keys.pkl").write_bytes(pickle.dumps(content))
+    assert load_plain_pickle(tmp_path / "keys.pkl") == content
+
+
 def test_the_number_that_an_object_claims_takes_no_memory(tmp_path):
     """PROTO 4, BININT1 1, LONG_BINPUT 100,000,000, STOP: Python would make a table of 1.6 GB for it."""
     (tmp_path / "memo.pkl").write_bytes(b"\x80\x04K\x01r" + (100_000_000).to_bytes(4, "little") + b".")

@@ -55,7 +55,7 @@ def find_weights(path: Path) -> tuple[Path, PublishedFile | None]:
     Raises UserError that says where the file can be downloaded and where it belongs, or which names there are.
     """
     published = PUBLISHED.get(str(path))
-    if path.exists():
+    if path.is_file():
         return path, None
     if published is None:
         if path.name == str(path) and not path.suffix:
@@ -79,7 +79,7 @@ def find_weights(path: Path) -> tuple[Path, PublishedFile | None]:
 def lane_graph_weights(path: Path) -> Path:
     """Return the file of weights of a lane graph's model; raise UserError for the name of published ones."""
     published = PUBLISHED.get(str(path))
-    if published is not None and not path.exists():
+    if published is not None and not path.is_file():
         owner, _, _ = published.configuration.partition("/")
         raise UserError(
             f"the published weights {path} are of {owner} models (--config {published.configuration}): for this "

@@ -24,7 +24,9 @@ from tflane_jax.datasets.openlane_frames import (
     SUBSETS,
     FrameFile,
     SubsetName,
+    has_time,
     info_path,
+    no_time,
     read_frame,
     source_logs,
 )
@@ -94,9 +96,12 @@ def check_openlane_v2(
         every = sorted({*named[split], *on_disk[split]}, key=lambda key: (key.segment, int(key.timestamp)))
         for subset in present:
             keys = [key for key in every if subsets.get((key.split, key.segment), present[0]) == subset]
+            found = len(faults)
+            if wrong := {key for key in keys if not has_time(key, subset)}:
+                faults.append(f"{root}: {len(wrong)} {split} frames, first {min(wrong)}: it {no_time(subset)}")
+                keys = [key for key in keys if key not in wrong]
             if not keys:
                 continue
-            found = len(faults)
             absent = set(named[split]).intersection(keys) - set(on_disk[split])
             if absent:
                 faults.append(
@@ -242,6 +247,8 @@ def _check_sd_maps(root: Path, keys: list[FrameKey], faults: list[str]) -> int:
 def _check_annotation(found: Annotation) -> Iterator[str]:
     if (far := max((float(np.abs(line[:, :2]).max()) for line in found.lines), default=0.0)) > _FARTHEST:
         yield f"a lane reaches {far:.0f} m from the vehicle, expected some 50: metres, in the ego frame?"
+    if any((line == line[0]).all() for line in (*found.lines, *(found.left or ()), *(found.right or ()), *found.areas)):
+        yield "a lane, boundary or area has no length: all of its points are at one place"
     if (np.diff(found.boxes, axis=1) <= 0.0).any():
         yield "a traffic element's box has no area: its points should be the top-left and the bottom-right corner"
     crossings = [found.areas[i] for i in np.flatnonzero(found.area_category == AreaType.PEDESTRIAN_CROSSING)]
@@ -260,7 +267,7 @@ def _check_motion(
         return
     (earlier, other), tick = before, SUBSETS[subset].tick_ns
     places = np.stack([other.global_from_ego, frame.global_from_ego])[:, :3, 3]
-    gap = min((int(key.timestamp) - int(earlier.timestamp)) * tick, 2**62)  # fits in 64 bits
+    gap = (int(key.timestamp) - int(earlier.timestamp)) * tick
     try:
         check_motion(places, np.array([0, gap]), [str(other.path), str(frame.path)])
     except UserError as error:

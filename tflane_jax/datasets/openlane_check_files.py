@@ -11,7 +11,7 @@ from tflane_jax.datasets.base import SPLITS, Split
 from tflane_jax.datasets.openlane_frames import SUBSETS, SubsetName, subset_of_frame
 from tflane_jax.datasets.openlane_sd_map import FILE
 from tflane_jax.errors import UserError
-from tflane_jax.files.fields import load_json
+from tflane_jax.files.fields import is_time, load_json
 from tflane_jax.files.openlane import FrameKey, frames_of
 
 # Frames of a segment that are read to find its subset.
@@ -32,13 +32,11 @@ def named_frames(root: Path, faults: list[str]) -> dict[Split, list[FrameKey]]:
                     continue
                 keys = frames_of(content, split, str(file))
                 faults += [
-                    f"{file}: {key} has no whole number as its timestamp"
-                    for key in keys
-                    if not key.timestamp.isdecimal()
+                    f"{file}: {key} has no whole number as its timestamp" for key in keys if not is_time(key.timestamp)
                 ]
                 if twice := len(keys) - len(set(keys)):
                     faults.append(f"{file}: {twice} {split} frames are named twice")
-                named[split] += [key for key in keys if key.timestamp.isdecimal()]
+                named[split] += [key for key in keys if is_time(key.timestamp)]
         except UserError as error:
             faults.append(str(error))
     return named

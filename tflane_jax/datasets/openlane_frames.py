@@ -155,7 +155,9 @@ def list_frames(root: Path, split: str, subset: SubsetName, data_dict: str | Non
         if not keys:
             remedy = _instead(split, others) if others else ": choose another split"
             raise UserError(f"{file} names no frame of split {split}{remedy}, or another split file (data_dict)")
-    return sorted(set(keys), key=lambda key: (key.segment, _time(key, root)))
+    if wrong := [key for key in sorted(keys) if not has_time(key, subset)]:
+        raise UserError(f"{root}: frame {wrong[0]} {no_time(subset)}: leave the file out")
+    return sorted(set(keys), key=lambda key: (key.segment, int(key.timestamp)))
 
 
 def _of_subset(root: Path, keys: list[FrameKey], subset: SubsetName) -> list[FrameKey]:
@@ -199,10 +201,16 @@ def _instead(split: str, others: Sequence[str]) -> str:
     )
 
 
-def _time(key: FrameKey, root: Path) -> int:
-    if not is_time(key.timestamp):
-        raise UserError(f"{root}: frame {key} has no whole number as its timestamp: leave the file out")
-    return int(key.timestamp)
+def has_time(key: FrameKey, subset: SubsetName) -> bool:
+    """Return whether a frame is named after a time in its subset's unit that fits in 64 bits as nanoseconds."""
+    ticks = np.iinfo(np.int64).max // SUBSETS[subset].tick_ns
+    return is_time(key.timestamp) and int(key.timestamp) <= ticks
+
+
+def no_time(subset: SubsetName) -> str:
+    """Return what is wrong with a frame that has no time."""
+    unit = {1: "nanoseconds", 1000: "microseconds"}[SUBSETS[subset].tick_ns]
+    return f"has no whole number of {unit} as its timestamp, as frames of subset {subset} have"
 
 
 MAP_CHANGES = frozenset(

@@ -23,7 +23,7 @@ from tflane_jax.datasets.identities import pairs_within
 from tflane_jax.datasets.lane_outlines import LaneOutline, boundaries
 from tflane_jax.datasets.openlane_annotation import Annotation, read_annotation
 from tflane_jax.datasets.openlane_frames import frame_pose
-from tflane_jax.datasets.plausible import check_motion
+from tflane_jax.datasets.plausible import FARTHEST_STEP, check_motion
 from tflane_jax.errors import UserError
 from tflane_jax.files.fields import load_json, member
 from tflane_jax.files.openlane import CENTERLINE, SEGMENT
@@ -74,6 +74,7 @@ def read_segment(files: Sequence[Path]) -> RoadMap:
         if content.get("annotation") is None:
             raise UserError(f"{where} has no annotation, as in the test split: take another segment")
         found = read_annotation(content["annotation"], names, where)
+        _check_lengths(found, where)
         lanes.step(_global(found, pose), found.is_connector, np.stack([found.left_type, found.right_type], -1))
         lanes.connect(found.successor)
         border = [
@@ -94,6 +95,13 @@ def read_segment(files: Sequence[Path]) -> RoadMap:
         raise UserError(f"{segment}: no frame has a lane: take another segment")
     border = tuple(parts[0] for parts in edges.parts)
     return RoadMap(map_name(segment), "openlane_v2", VectorMap(segments, (), border), places, COMPLETE)
+
+
+def _check_lengths(found: Annotation, where: str) -> None:
+    """Raise UserError for a line that is impossibly long, which would become millions of points."""
+    lines = (*found.lines, *(found.left or ()), *(found.right or ()), *found.areas)
+    if (longest := max((float(arc_length(line)[-1]) for line in lines), default=0.0)) > FARTHEST_STEP:
+        raise UserError(f"{where}: a line is {longest / 1e3:.0f} km long, in a frame of some 100 m: restore the file")
 
 
 def map_name(segment: Path) -> str:

@@ -12,6 +12,7 @@ from tflane_jax.errors import UserError, missing_extra
 
 Kind = Literal["integer", "number", "text"]
 """What a column holds: whole numbers (int64), finite numbers (float64), or text (str)."""
+_LONGEST_TEXT = 1000
 
 
 def read_columns(path: Path, columns: Mapping[str, Kind]) -> dict[str, np.ndarray]:
@@ -41,6 +42,7 @@ def read_columns(path: Path, columns: Mapping[str, Kind]) -> dict[str, np.ndarra
 
 def _column(path: Path, name: str, column: Any, kind: Kind) -> np.ndarray:
     import pyarrow.types as types
+    from pyarrow import compute
 
     of_kind = {
         "integer": types.is_integer(column.type),
@@ -55,9 +57,12 @@ def _column(path: Path, name: str, column: Any, kind: Kind) -> np.ndarray:
     if not of_kind and len(column):
         what = {"integer": "whole numbers", "number": "numbers", "text": "text"}[kind]
         raise UserError(f"{path}: column {name} holds {column.type}, expected {what}: download it again")
-    values = column.to_numpy()
     if kind == "text":
-        return values.astype(str)
+        # An array of texts gives each of them the room of the longest.
+        if (longest := compute.max(compute.utf8_length(column.cast("string"))).as_py() or 0) > _LONGEST_TEXT:
+            raise UserError(f"{path}: column {name} holds a text of {longest} characters: download it again")
+        return column.to_numpy().astype(str)
+    values = column.to_numpy()
     values = values.astype(np.int64 if kind == "integer" else np.float64)
     if not np.isfinite(values).all():
         row = int(np.argmin(np.isfinite(values)))

@@ -177,7 +177,7 @@ def _as_array(value: Any, shape: tuple[int | None, ...], where: str) -> np.ndarr
     if array.dtype.kind in "iuf":
         if _has_truth_value(value):
             raise UserError(f"{where} holds a truth value, {expected}")
-        return array if array.dtype == np.float32 else array.astype(np.float64)
+        return array if array.dtype == np.float32 else array.astype(np.float64, copy=False)
     if array.dtype.kind == "O" and array.size:  # such as integers of more than 64 bits
         wrong = [item for item in array.flat if not _is_number(item)]
         if wrong:

@@ -9,7 +9,7 @@ from tflane_jax.datasets.batches import batches
 from tflane_jax.datasets.empty_frames import has_truth, without_empty
 from tflane_jax.datasets.streaming import Streamed, StreamingConfig
 from tflane_jax.errors import UserError
-from tflane_jax.scene import stack_examples
+from tflane_jax.scene import LineClass, MapLines, stack_examples
 
 
 class Gaps(FakeDataset):
@@ -32,6 +32,17 @@ def test_only_the_named_parts_count_and_of_areas_only_crossings():
     assert has_truth(example, ["segments", "areas"])
     example.areas.category[:] = 2
     assert not has_truth(example, ["segments", "areas"])
+
+
+def test_lines_of_classes_that_are_not_learned_do_not_count():
+    lines = MapLines.empty(2, 3)
+    lines.valid[0], lines.category[0] = True, LineClass.CENTERLINE
+    example = fake_example().replace(map_lines=lines)
+    assert has_truth(example, ["map_lines"])
+    assert has_truth(example, ["map_lines"], 4)
+    assert not has_truth(example, ["map_lines"], 3)
+    with pytest.raises(UserError, match="empty_frames=keep"):
+        without_empty(stack_examples([example]), ["map_lines"], 3)
 
 
 def test_examples_in_memory_are_selected_and_clips_need_one_frame():

@@ -7,6 +7,7 @@ import pytest
 from tests.models.cases import BASELINE, CAMERA_TOPONET, LIFTED_LINES, SEGMENTS
 from tflane_jax.limits import SettingError
 from tflane_jax.models.area_decoder import AreaDecoderConfig
+from tflane_jax.models.maptr import MapTrConfig
 
 
 def changed(config, path, value):
@@ -22,6 +23,7 @@ CASES = [
     (BASELINE, "encoder.dim", 12, "a multiple of 8"),
     (BASELINE, "encoder.levels", (16, 12), "multiples of 8"),
     (CAMERA_TOPONET, "elements.dim", 32, r"encoder\.images\.pyramid\.dim \(16\)"),
+    (CAMERA_TOPONET, "encoder.line_masks", True, "False: only MapTRv2"),
     (BUCKET, "areas.coordinates", 2, "3"),
     (BUCKET, "areas.classes", 3, "2"),
 ]
@@ -32,6 +34,16 @@ def test_a_setting_that_does_not_fit_the_others_is_named(config, path, value, al
     config.build()
     with pytest.raises(SettingError, match=rf"^{path} is .*: it must be {allowed}"):
         changed(config, path, value).build()
+
+
+def test_only_maptrv2_learns_depth_and_masks_in_the_images():
+    """Regression: other hosts took the settings and learned neither, without a word."""
+    LIFTED_LINES.build()
+    with pytest.raises(SettingError, match=r"^encoder\.line_masks is True: it must be False: only MapTRv2 has a loss"):
+        MapTrConfig(encoder=LIFTED_LINES.encoder).build()
+    without = changed(LIFTED_LINES.encoder, "line_masks", False)
+    with pytest.raises(SettingError, match=r"^encoder\.bev\.supervised is True: it must be False: only MapTRv2"):
+        MapTrConfig(encoder=without).build()
 
 
 @pytest.mark.parametrize("config", [BASELINE, LIFTED_LINES])

@@ -42,7 +42,6 @@ def read_columns(path: Path, columns: Mapping[str, Kind]) -> dict[str, np.ndarra
 
 def _column(path: Path, name: str, column: Any, kind: Kind) -> np.ndarray:
     import pyarrow.types as types
-    from pyarrow import compute
 
     of_kind = {
         "integer": types.is_integer(column.type),
@@ -57,12 +56,12 @@ def _column(path: Path, name: str, column: Any, kind: Kind) -> np.ndarray:
     if not of_kind and len(column):
         what = {"integer": "whole numbers", "number": "numbers", "text": "text"}[kind]
         raise UserError(f"{path}: column {name} holds {column.type}, expected {what}: download it again")
+    values = column.to_numpy()
     if kind == "text":
         # An array of texts gives each of them the room of the longest.
-        if (longest := compute.max(compute.utf8_length(column.cast("string"))).as_py() or 0) > _LONGEST_TEXT:
+        if (longest := max(map(len, values), default=0)) > _LONGEST_TEXT:
             raise UserError(f"{path}: column {name} holds a text of {longest} characters: download it again")
-        return column.to_numpy().astype(str)
-    values = column.to_numpy()
+        return values.astype(str)
     values = values.astype(np.int64 if kind == "integer" else np.float64)
     if not np.isfinite(values).all():
         row = int(np.argmin(np.isfinite(values)))

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, Int
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.limits import Rules
-from tflane_jax.models.auxiliary import AUXILIARY, LaneCellHead, LineMaskHead
+from tflane_jax.models.auxiliary import AUXILIARY, AuxiliaryName, LaneCellHead, LineMaskHead
 from tflane_jax.models.bev_encoder import SMALL_BEVFORMER, BevFormerConfig, BevMemory
 from tflane_jax.models.bevformer import BevFormer
 from tflane_jax.models.image_encoder import PAPER_IMAGE_ENCODER, ImageEncoder, ImageEncoderConfig
@@ -59,6 +59,15 @@ class CameraEncoderConfig:
         levels = self.bev.levels if isinstance(self.bev, BevFormerConfig) else 1
         yield "bev.dim", self.bev.dim == pyramid.dim, f"that of the image features (images.pyramid.dim, {pyramid.dim})"
         yield "images.pyramid.levels", pyramid.levels == levels, f"{levels}, the levels that bev takes"
+
+    @property
+    def learned(self) -> dict[AuxiliaryName, str]:
+        """Auxiliary outputs for which a host needs a loss, and the setting that asks for each."""
+        asked: dict[AuxiliaryName, tuple[str, bool]] = {
+            "view_line_masks": ("line_masks", self.line_masks),
+            "depth": ("bev.supervised", isinstance(self.bev, LiftConfig) and self.bev.supervised),
+        }
+        return {name: setting for name, (setting, wanted) in asked.items() if wanted}
 
     @property
     def bev_range(self) -> PerceptionRange:

@@ -72,7 +72,9 @@ class HostConfig:
     """What a query represents, see `HostSpec.query_type`."""
 
     def limits(self) -> Rules:
-        """What the priors demand of their host."""
+        """What the priors demand of their host; that it has a loss for what its encoder is to learn."""
+        for name, setting in getattr(self.encoder, "learned", {}).items():
+            yield f"encoder.{setting}", name in self.auxiliary, "False: only MapTRv2 has a loss for it"
         for name, prior in self.priors.configured.items():
             for setting, fits, wanted in getattr(prior, "host_limits", lambda host: ())(self.spec):
                 yield f"priors.{name}.{setting}", fits, wanted
@@ -86,6 +88,11 @@ class HostConfig:
     def wanted_truth(self) -> tuple[str, ...]:
         """Fields of `truth` that count for `LaneGraphTask.empty_frames`: a frame without any of them is empty."""
         return self.truth
+
+    @property
+    def line_classes(self) -> int | None:
+        """Number of classes of map lines that it learns; None for a host of lanes or segments."""
+        return None
 
     @property
     def auxiliary(self) -> tuple[AuxiliaryName, ...]:
@@ -177,7 +184,8 @@ class Host(nn.Module):
 
         Args:
             example: one frame.
-            memory: of the previous frame; None: no previous frame. No gradient flows through its BEV features.
+            memory: of the previous frame, of `HostConfig.start` for the first frame of a sequence; None: the frame
+                stands alone, and priors remember nothing of it. No gradient flows through its BEV features.
             train: dropout is on, which needs the random key `dropout`; norms use batch statistics.
 
         Raises:

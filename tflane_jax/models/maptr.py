@@ -83,6 +83,11 @@ class MapTrConfig(HostConfig):
         return self.decoder.dim
 
     @property
+    def line_classes(self) -> int:
+        """Number of classes of map lines that it learns."""
+        return self.decoder.classes
+
+    @property
     def auxiliary(self) -> tuple[AuxiliaryName, ...]:
         """The denoised lines, and the outputs of every host."""
         return (*(() if self.denoising is None else ("denoised",)), *super().auxiliary)

@@ -47,14 +47,9 @@ class MapTrV2Config(MapTrConfig):
     @property
     def auxiliary(self) -> tuple[AuxiliaryName, ...]:
         """Those of MapTR, the one-to-many group, and those that BEV and image features learn."""
-        encoder = self.encoder if isinstance(self.encoder, CameraEncoderConfig) else None
-        learned: dict[AuxiliaryName, bool] = {
-            "one_to_many": self.many > 0,
-            "line_mask": self.line_mask,
-            "view_line_masks": encoder is not None and encoder.line_masks,
-            "depth": encoder is not None and isinstance(encoder.bev, LiftConfig) and encoder.bev.supervised,
-        }
-        return (*super().auxiliary, *(name for name, wanted in learned.items() if wanted))
+        own: dict[AuxiliaryName, bool] = {"one_to_many": self.many > 0, "line_mask": self.line_mask}
+        learned: dict[AuxiliaryName, str] = getattr(self.encoder, "learned", {})
+        return (*super().auxiliary, *(name for name, wanted in own.items() if wanted), *learned)
 
     def build(self) -> Host:
         """Return the Linen module; raises UserError where its parts do not fit together."""

@@ -177,8 +177,9 @@ class LaneGraphTask(Task[Example, Example | Streamed, LaneGraphSource, HostMemor
     def step(self, params: Params, memory: HostMemory | None, example: Example) -> tuple[HostMemory, Prediction]:
         """Return the memory for the next frame, and the prediction for this one.
 
-        For live streams: `memory, prediction = step(params, memory, example)`. For examples with a leading axis:
-        `lax.scan(partial(task.step, params), task.start(), examples)`, with equal results.
+        For live streams: `memory, prediction = step(params, memory, example)`, from `start()` on. For examples with a
+        leading axis: `lax.scan(partial(task.step, params), task.start(), examples)`, with equal results. Without a
+        memory (None), a frame stands alone: priors remember nothing of it, nor of the frames after it.
         """
         # The barrier keeps XLA from hoisting parameter-only terms out of a scan, which would change their rounding.
         params, example = lax.optimization_barrier((params, example))
@@ -205,7 +206,9 @@ class LaneGraphTask(Task[Example, Example | Streamed, LaneGraphSource, HostMemor
     def examples(self, data: Example | Streamed) -> Example | Streamed:
         """Return the examples themselves, or the clips that they form."""
         data = data if self.clip == 1 else as_clips(data, self.clip)
-        return data if self.empty_frames == "keep" else without_empty(data, self.model.wanted_truth)
+        if self.empty_frames == "keep":
+            return data
+        return without_empty(data, self.model.wanted_truth, self.model.line_classes)
 
     def shapes(self, data: SplitData) -> Example:
         """Return shapes of the training parts of an example."""

@@ -40,7 +40,11 @@ def test_data_stats_counts_map_lines(capsys):
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
-    [(["--count", "0"], "nothing to count"), (["--data", "front-views"], "are no lane graphs")],
+    [
+        (["--count", "0"], "nothing to count"),
+        (["--count", "-1"], "-1 asked for"),
+        (["--data", "front-views"], "are no lane graphs"),
+    ],
 )
 def test_data_stats_needs_lane_graphs(arguments, message, capsys):
     assert main(["data", "stats", *arguments]) == 2

@@ -163,6 +163,23 @@ def test_what_one_cannot_read_before_the_first_step_ends_all_with_the_same_messa
 
 
 @pytest.mark.slow
+def test_all_processes_have_the_same_examples(tmp_path):
+    """Regression: each drew its part of a batch from a permutation of its own."""
+    said = together(tmp_path / "run", ["new", "fewer"])
+    why = "it has 19 training examples, the first process 20: give all processes the same data"
+    assert [each["error"] for each in said] == [f"process 1: {why}", why]
+    assert not (tmp_path / "run" / "config.json").exists()
+
+
+@pytest.mark.slow
+def test_one_that_is_stopped_alone_ends_the_others(tmp_path):
+    """Regression: they waited for it, and it for them, for five minutes."""
+    (first, *_), (second, *_) = ended(begun(tmp_path / "run", ["new", "early"]))
+    assert second == 128 + signal.SIGTERM
+    assert first != 0
+
+
+@pytest.mark.slow
 def test_the_command_line_trains_on_two_processes(tmp_path):
     (tmp_path / "tiny.py").write_text(TINY)
     folder, joined = tmp_path / "run", ["--coordinator", f"localhost:{free_port()}", "--processes", "2", "--process"]

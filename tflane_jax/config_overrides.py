@@ -187,7 +187,7 @@ def _without_boxes(text: str) -> str:
     paragraphs = re.split(r"\n{2,}", "\n".join(lines).strip())
     message = paragraphs[0].replace("\n", " ")
     if message.startswith(_LEFT_OVER):
-        first = message.removeprefix(_LEFT_OVER).split()[0]
+        first = message.removeprefix(_LEFT_OVER).split()[0].rstrip(",")
         return f"{first} is neither a setting nor the value of one: settings are given as, say, --optim.lr 1e-3"
     if (wrong := _NO_NUMBER.search(message)) is None:
         return message

@@ -12,6 +12,7 @@ import contextlib
 import contextvars
 import json
 import os
+import signal
 import sys
 import traceback
 from collections.abc import Callable, Iterator
@@ -162,9 +163,18 @@ def leaving() -> Iterator[None]:
             print(f"tflane: {error}", file=sys.stderr)
         else:
             traceback.print_exc()
+        end_alone(2 if isinstance(error, UserError) else 1)
+    except KeyboardInterrupt as error:
+        end_alone(128 + getattr(error, "number", signal.SIGINT))
+        raise
+
+
+def end_alone(code: int) -> None:
+    """End this process at once if it is one of several, which wait for it: JAX ends them. No-op for a single one."""
+    if count() > 1:
         sys.stdout.flush()
         sys.stderr.flush()
-        os._exit(2 if isinstance(error, UserError) else 1)
+        os._exit(code)
 
 
 def _own(error: Exception | None) -> Exception | None:

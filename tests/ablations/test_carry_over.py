@@ -281,6 +281,33 @@ def test_models_are_compared_on_the_seeds_that_all_of_them_have(tmp_path, monkey
     }
 
 
+@pytest.mark.parametrize(
+    ("seeds", "interim", "over", "once"),
+    [
+        ({"a": {0, 1, 2}, "b": {0, 1, 2}}, "", "mean over 3 seeds", False),
+        ({"a": {1}, "b": {1}}, "1 of 3 declared seeds (1)", "1 seed", True),
+        (
+            {"a": {0, 1}, "b": {1, 2}},
+            "each log has 2 of 3 declared seeds, not all the same",
+            "mean over 2 seeds",
+            False,
+        ),
+        ({"a": {0, 1}, "b": {2}}, "each log has 1 to 2 of 3 declared seeds, not all", "mean over 1 to 2 seeds", False),
+    ],
+)
+def test_tables_name_the_seeds_of_every_log(tmp_path, seeds, interim, over, once):
+    """Regression: they named those that all logs have, "trained once" where each mean was over two trainings."""
+    found = {row: {log: {PRIMARY: 0.5, "all/recall": 0.5} for log in "ab"} for row in ("base", "tfm")}
+    declaration = Declaration(PRIMARY, (Claim("tfm", "base"),))
+    declared = Declared(declaration, (0, 1, 2), "today", 0, ("a", "b"))
+    subject._save(found, seeds, declared, "a protocol", tmp_path, quick=False)
+    effects, logs = ((tmp_path / f"{name}.md").read_text() for name in ("effects", "logs"))
+    assert interim in effects
+    assert ("Interim" in effects) == bool(interim)
+    assert ("trained once" in effects) == once
+    assert f"percent ({over}" in logs
+
+
 def test_claims_about_rows_without_a_result_are_listed_and_counted():
     """Two claims, one of them about a model whose trainings failed: the p of the other is doubled by Holm."""
     logs = tuple("abcdef")

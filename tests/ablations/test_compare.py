@@ -44,6 +44,34 @@ def test_a_worker_that_is_killed_is_named_by_its_run(tmp_path):
     assert "killed by SIGKILL" in job.log.read_text()
 
 
+def test_a_configuration_that_cannot_be_sent_is_an_error_and_leaves_the_worker_free(tmp_path):
+    """Regression: the comparison waited for its end for ever."""
+
+    class Local(type(CONFIG.task.model)):
+        pass
+
+    task = dataclasses.replace(CONFIG.task, model=Local(**vars(CONFIG.task.model)))
+    with Worker([]) as worker:
+        with pytest.raises(
+            UserError, match=r"cannot be sent to a worker .*: define own classes and functions at the top"
+        ):
+            worker.begin(Job(dataclasses.replace(CONFIG, task=task), tmp_path / "seed_0"))
+        assert worker.job is None
+
+
+def test_runs_that_are_trained_anew_count_from_their_beginning(tmp_path, monkeypatch):
+    """Regression: the bar showed the steps of the runs that were to be deleted."""
+    jobs = [Job(CONFIG, tmp_path / name, retrain=True) for name in ("other", "same")]
+    starts = {"other": "overwrite", "same": "resume"}
+    monkeypatch.setattr(Job, "start", lambda job: starts[job.folder.name])
+    monkeypatch.setattr(Job, "step", lambda job: 2)
+    anew = {job.place for job in jobs if job.start() == "overwrite"}
+    assert workers._steps(jobs, jobs[1:], anew) == 2
+    assert workers._steps(jobs, jobs, anew) == 2
+    starts["other"] = "new"
+    assert workers._steps(jobs, jobs, anew) == 4
+
+
 def test_all_workers_are_told_to_end_before_one_is_waited_for(tmp_path, monkeypatch):
     ended = []
 

@@ -1,9 +1,9 @@
 """One of several processes that train the stub task: `python -m tests.training.many_processes FOLDER PORT N I START`.
 
 START "new", "resume", or "shared", which is new with a state that all share, as is "unpictured", which cannot draw;
-"stopped" sends this process SIGTERM in its first evaluation, "killed" SIGKILL in its second one; "unreadable:STEP"
-cannot read the data of an update. It evaluates with predictions, which all processes make together, and draws with
-predictions of its own.
+"early" stops this process before it begins, "stopped" sends it SIGTERM in its first evaluation, "killed" SIGKILL in
+its second one; "unreadable:STEP" cannot read the data of an update, "fewer" lacks one of the examples. It evaluates
+with predictions, which all processes make together, and draws with predictions of its own.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from tests.training.many_devices import EVENLY, Line
 from tests.training.stub import line_arrays
 from tests.training.stub_run import run
 from tflane_jax import processes
-from tflane_jax.errors import UserError
+from tflane_jax.errors import Interrupted, UserError
 from tflane_jax.evaluation.predict import predicted_batches, predictions
 
 CONFIG = dataclasses.replace(EVENLY, seeds=(0,))
@@ -73,6 +73,10 @@ def main() -> None:
         config = dataclasses.replace(CONFIG, shard_state=start in ("shared", "unpictured"))
         others = {"evaluate": evaluate, "draw": None if start == "unpictured" else draw}
         with processes.leaving():
+            if start == "early":
+                processes.from_first(lambda: None)
+                raise Interrupted(signal.SIGTERM)
+            others["arrays"] = line_arrays(19 if start == "fewer" else 20)
             result = run(Path(folder), start=begin, config=config, prepare=prepare, **others)
     except UserError as error:
         print(json.dumps({"error": str(error)}))

@@ -2,6 +2,7 @@
 
 import errno
 import json
+import os
 import shutil
 import sys
 import time
@@ -275,6 +276,31 @@ def test_a_full_disk_is_a_message_and_leaves_nothing(tmp_path, state, monkeypatc
     with pytest.raises(UserError, match="No space left on device"):
         saved(tmp_path, state, [(1, None)])
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("moment", ["flush", "rename"])
+@pytest.mark.parametrize("keep", [1, 2])
+def test_a_full_disk_takes_no_checkpoint_that_was_to_be_replaced(tmp_path, state, monkeypatch, keep, moment):
+    """Regression: it was deleted before the new one was on the disk."""
+    saved(tmp_path, state, [(1, None), (2, None)], keep=keep)
+    left = Checkpoints(tmp_path).steps()
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    rename = os.replace
+    with monkeypatch.context() as patch:
+        if moment == "flush":
+            patch.setattr("tflane_jax.files.atomic.flush", full)
+        else:
+            patch.setattr(os, "replace", lambda old, new: full() if ".writing" in str(old) else rename(old, new))
+        with pytest.raises(UserError, match="No space left on device"):
+            saved(tmp_path, state, [(2, 0.7)], keep=keep)
+    checkpoints = Checkpoints(tmp_path)
+    assert checkpoints.steps() == left
+    assert checkpoints.arrays(2)
+    assert len(list(tmp_path.iterdir())) == len(left)
+    assert saved(tmp_path, state, [(2, 0.7)], keep=keep).manifest(2).metrics == {"score": 0.7}
 
 
 def test_a_write_that_the_system_refuses_is_one_message(tmp_path, state, capfd, monkeypatch):

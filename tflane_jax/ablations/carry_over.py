@@ -180,9 +180,14 @@ def _save(
     logs = [log for log in next(iter(found.values())) if all(log in by_log for by_log in found.values())]
     if not logs:
         raise UserError("no log has been tested with every model yet: run the same command again")
-    seeds = sorted(set.intersection(*(seeds_by_log[log] for log in logs)))
+    seeds = sorted(set.union(*(seeds_by_log[log] for log in logs)))
+    counts = sorted({len(seeds_by_log[log]) for log in logs})
+    number = f"{counts[0]} to {counts[-1]}" if len(counts) > 1 else f"{counts[0]}"
     note = "SMOKE TEST, a few updates on a few scenes: no result. " if quick else ""
     interim = declared.interim(seeds, logs)
+    if counts[0] < len(seeds):
+        which = f"**Interim**: each log has {number} of {len(declared.seeds)} declared seeds, not all the same."
+        interim = " ".join(filter(None, [which, declared.interim(declared.seeds, logs)]))
     ending = " ".join(filter(None, [".", interim, FITTED]))
     meta = {"logs": logs, "seeds": list(seeds), "protocol": protocol, "quick": quick, "fitted": FITTED}
     columns = [key for key in COLUMNS if all(key in found[row][log] for row in found for log in logs)]
@@ -195,11 +200,11 @@ def _save(
         for log in logs
         for row in found
     ]
-    over = f"mean over {len(seeds)} seeds" if len(seeds) > 1 else "1 seed"
+    over = "1 seed" if counts == [1] else f"mean over {number} seeds"
     save_table(out / "logs", each, meta, title=f"{note}{protocol}, percent ({over}){ending}")
     tests = _tests(found, logs, declared)
     paired = f"Paired over {len(logs)} logs, points."
-    once = "" if len(seeds) > 1 else _ONE_TRAINING
+    once = _ONE_TRAINING if counts == [1] else ""
     title = " ".join(filter(None, [note.strip(), declared.sentence(), interim, paired, once, FITTED]))
     save_table(out / "effects", tests, meta, title=title, digits=4)
     print("\n" + format_table(tests, title=title, digits=4))

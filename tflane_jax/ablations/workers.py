@@ -13,6 +13,7 @@ import sys
 import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from tflane_jax import accelerators
@@ -29,6 +30,7 @@ from tflane_jax.progress import progress_bar
 from tflane_jax.run_checks import check_run
 from tflane_jax.runs import build_data, train_run
 from tflane_jax.startup import leave, showing, write
+from tflane_jax.training.array_files import first_line
 from tflane_jax.training.provenance import thread_setting
 from tflane_jax.training.runtime import configure_jax
 
@@ -128,6 +130,7 @@ def _train_in_workers(
         workers = [stack.enter_context(Worker(share, slot, len(shares))) for slot, share in enumerate(shares)]
         stack.callback(lambda: [worker.end() for worker in workers])  # before any of them is waited for
         total, done = sum(job.config.training.steps for job in jobs), sum(job.resumes_at() for job in jobs)
+        anew = {job.place for job in jobs if job.start() == "overwrite"}  # their folders hold records of other runs
         bar = stack.enter_context(
             progress_bar(total=total, initial=done, desc=f"train and measure {len(jobs)} runs", unit="step")
         )
@@ -144,7 +147,8 @@ def _train_in_workers(
                     _tell([failure for failure in failures if failure.job is chosen])
             time.sleep(_POLL_SECONDS)
             bar.set_postfix_str(_running(workers, queue), refresh=False)
-            bar.update(sum(job.step() for job in jobs) - bar.n)
+            training = [worker.job for worker in workers if worker.job is not None]
+            bar.update(_steps(jobs, [*training, *queue.elsewhere], anew) - bar.n)
             for worker in workers:
                 job = worker.job
                 if (failure := worker.check()) is not None:
@@ -156,6 +160,19 @@ def _train_in_workers(
                             finished(job)
                     queue.done(job)
     return failures
+
+
+def _steps(jobs: Sequence[Job], begun: Sequence[Job], anew: set[Path]) -> int:
+    """Return the updates that all runs have made.
+
+    Args:
+        jobs: of the comparison.
+        begun: those that are being trained.
+        anew: places of runs that are trained anew, whose folders hold records of other runs until they begin; those
+            that have begun are taken out.
+    """
+    anew -= {job.place for job in begun if job.start() != "overwrite"}
+    return sum(job.step() for job in jobs if job.place not in anew)
 
 
 def _running(workers: Sequence[Worker], queue: Queue) -> str:
@@ -218,15 +235,23 @@ class Worker:
         self._process.join()
 
     def begin(self, job: Job) -> None:
-        """Let the process train a job."""
+        """Let the process train a job; raise UserError for one that cannot be sent there."""
         if self._process.exitcode is not None:
             self._pipe.close()
             self._begin_process()
         self.job, self.stage = job, ""
         self.tasks.add(job.config.task)
         job.log.parent.mkdir(parents=True, exist_ok=True)
-        with contextlib.suppress(OSError):  # a process that is gone is found by `check`
+        try:
             self._pipe.send(job)
+        except OSError:
+            pass  # a process that is gone is found by `check`
+        except Exception as error:
+            self.job = None
+            raise UserError(
+                f"its configuration cannot be sent to a worker process ({first_line(error)}): define own classes and "
+                "functions at the top level of a module, or leave out --jobs and --cores"
+            ) from error
 
     def check(self) -> Failure | None:
         """Return why the current job failed, if it did; a process that is gone is replaced when the next job begins."""

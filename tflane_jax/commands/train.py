@@ -58,6 +58,7 @@ def _trained(options: argparse.Namespace, overrides: Sequence[str]) -> int:
         began = options.start == "resume" or _saved_at(out) != before
         remedy = f"; {resume}" if began else _NOT_BEGUN
         print(f"stopped by {signal.Signals(number).name}{remedy}", file=sys.stderr)
+        processes.end_alone(128 + number)
         return 128 + number
     if result.stopped_by is not None:
         name = signal.Signals(result.stopped_by).name

@@ -104,9 +104,15 @@ def flush(path: Path) -> None:
 
 
 def rename_flushed(written: Path, path: Path) -> None:
-    """Rename a file or folder to a name that is free, so that a power failure leaves all of it or nothing there."""
+    """Rename a folder, in the place of one of that name; a power failure leaves the whole of either there.
+
+    After an OSError, what was there is there again.
+    """
     flush(written)
-    written.rename(path)
+    if os.path.lexists(path):
+        _replace_folder(written, path)
+    else:
+        written.rename(path)
     _flush_one(path.parent)
 
 

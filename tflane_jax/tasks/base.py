@@ -203,5 +203,5 @@ AnyTask = Task[Any, Any, Any, Any]
 
 
 def spread(size: int, count: int) -> list[int]:
-    """Return `count` indices spread evenly over `size` (all of them if there are fewer)."""
-    return np.unique(np.linspace(0, size - 1, min(count, size)).round().astype(int)).tolist()
+    """Return `count` indices spread evenly over `size` (all of them if there are fewer); none for less than one."""
+    return np.unique(np.linspace(0, size - 1, min(max(count, 0), size)).round().astype(int)).tolist()

@@ -25,7 +25,7 @@ from flax import serialization
 from flax.traverse_util import unflatten_dict
 
 from tflane_jax.errors import UserError
-from tflane_jax.files.atomic import rename_flushed
+from tflane_jax.files.atomic import is_temporary, rename_flushed
 from tflane_jax.training.array_files import first_line, flat, load_arrays, save_arrays, system_error
 from tflane_jax.training.state import TrainState, state_from, tree_of
 
@@ -122,16 +122,13 @@ class Checkpoints:
         writing = self.folder / f".writing-{os.getpid()}"
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            for stale in self.folder.glob(".writing-*"):  # left by a process that was killed: unfinished, or dropped
-                shutil.rmtree(stale, ignore_errors=True)
+            for stale in self.folder.iterdir():  # left by a process that was killed: unfinished, dropped or replaced
+                if stale.name.startswith(".writing-") or is_temporary(stale):
+                    shutil.rmtree(stale, ignore_errors=True)
             save_arrays(writing / "state", _plain(state))
             content = asdict(manifest) | {"files": _checksums(writing)}
             content["progress"] = {**manifest.progress, _CONFIG_SUM: _sum_of(manifest.config)}
             (writing / "manifest.json").write_text(json.dumps(content, indent=1), encoding="utf-8")
-            if place.is_dir():
-                self._drop(place)
-            else:
-                place.unlink(missing_ok=True)
             rename_flushed(writing, place)
             self._drop_old()
         except OSError as error:

@@ -34,7 +34,7 @@ from tflane_jax.training.notices import NO_BEST, due_notices, not_finite, print_
 from tflane_jax.training.provenance import add_provenance
 from tflane_jax.training.records import Record, RecordWriter, Unwritten, Window, by_name, read_records, seed_record
 from tflane_jax.training.restarts import adapt
-from tflane_jax.training.run_folder import CurrentForm, Start, check_same_data, check_unchanged, claimed
+from tflane_jax.training.run_folder import CurrentForm, Start, agree_on_data, check_same_data, check_unchanged, claimed
 from tflane_jax.training.schedule import OptimConfig, make_optimizer, scaled_to_batch
 from tflane_jax.training.sharding import placed
 from tflane_jax.training.state import init_states, of_all_seeds, per_seed, state_of
@@ -191,6 +191,7 @@ def train(
         window, metrics, times = Window(), {}, StepTime()
         memories, started_from = [Memory() for _ in config.seeds], {}
         data, due = {"examples": example_count(arrays), "content": content}, False
+        agree_on_data(data)
         if start == "resume" and (latest := from_first(lambda: _latest(checkpoints))) is not None:
             whole = of_all_seeds(states)
             with stage(f"restoring step {latest['step']}"):

@@ -24,6 +24,7 @@ from tflane_jax.files.atomic import check_writable, is_temporary
 from tflane_jax.files.fields import load_json
 from tflane_jax.files.locks import take
 from tflane_jax.migrations import value_at
+from tflane_jax.processes import agreed, from_first
 from tflane_jax.startup import write
 
 Start = Literal["new", "resume", "overwrite"]
@@ -90,15 +91,29 @@ def check_unchanged(folder: Path, resolved: dict[str, Any], current_form: Curren
     return notices
 
 
+def agree_on_data(data: Mapping[str, Any]) -> None:
+    """Raise UserError, in all processes, where one has another number of "examples" or other files than the first."""
+    first = from_first(lambda: dict(data))
+    with agreed():
+        if data != first:
+            found = f"{data['examples']} training examples, the first process {first['examples']}"
+            if data["examples"] == first["examples"]:
+                found = "other scenes or maps to train on than the first process"
+            raise UserError(f"it has {found}: give all processes the same data")
+
+
 def check_same_data(folder: Path, before: Mapping[str, Any], now: Mapping[str, Any]) -> None:
     """Raise UserError if a run was trained on another number of "examples", or on files with another "content"."""
+    change = ""
     if before["examples"] != now["examples"]:
         change = f"was trained on {before['examples']} examples, and the training data have {now['examples']} now"
     elif before["content"] != now["content"]:
         change = "was trained on other scenes or maps: the files of its training data have changed since"
-    else:
-        return
-    raise UserError(f"{folder} {change}: restore them, or start another run (from this one: training.init_from)")
+    with agreed():
+        if change:
+            raise UserError(
+                f"{folder} {change}: restore them, or start another run (from this one: training.init_from)"
+            )
 
 
 def unused_changes(folder: Path, used: dict[str, Any], current_form: CurrentForm) -> list[str]:

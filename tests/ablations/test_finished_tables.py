@@ -94,6 +94,11 @@ def test_pairs_that_test_a_claim_count_before_runs(tiny, tmp_path, monkeypatch, 
     monkeypatch.setattr(Job, "is_complete", lambda job: job.label in complete[job.threads.get("device")])
     jobs = plan_table(small(tiny), range(2), tmp_path, finished=True).jobs
     assert {job.threads.get("device") for of_row in jobs.values() for job in of_row} == {taken}
+    for kind, device in (("cpu", None), ("gpu", "gpu: x")):
+        jobs = plan_table(small(tiny), range(2), tmp_path, finished=True, device=kind).jobs
+        assert {job.threads.get("device") for of_row in jobs.values() for job in of_row} == {device}
+    with pytest.raises(UserError, match=r"no run of paper\.9 on a tpu is known"):
+        plan_table(small(tiny), range(2), tmp_path, finished=True, device="tpu")
 
 
 @pytest.mark.slow
@@ -107,6 +112,11 @@ def test_a_run_without_its_parameters_counts_but_is_not_drawn(tiny, trained, mon
     assert "base is not drawn: the parameters in " in capsys.readouterr().out
     assert summary(trained)["seeds"] == [0, 1, 2]
     assert not (trained / "paper.9" / "comparison.png").exists()
+
+
+def test_a_device_is_chosen_among_finished_runs_only(capsys):
+    assert main(["tables", "gtn_lane.1", "--device", "gpu"]) == 2
+    assert "--device is about runs that exist: add --finished" in capsys.readouterr().err
 
 
 def test_no_run_is_an_error(tiny, tmp_path):

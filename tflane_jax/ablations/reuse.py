@@ -74,7 +74,12 @@ def thread_settings(archive: Archive, own: Mapping[str, Any]) -> list[Mapping[st
 
 
 def with_recorded(
-    plans: Sequence[Plan], archive: Archive, declaration: Declaration, *, finished: bool = False
+    plans: Sequence[Plan],
+    archive: Archive,
+    declaration: Declaration,
+    *,
+    finished: bool = False,
+    device: str | None = None,
 ) -> dict[str, list[Job]]:
     """Return the first plan with recorded runs in the place of trainings.
 
@@ -88,6 +93,9 @@ def with_recorded(
         finished: nothing is going to be trained, so that complete runs of any thread setting are taken; of several
             devices, those of the one that tests the most: with the most pairs of runs for the claims, then the most
             runs.
+        device: with `finished`, the kind of device ("cpu", "gpu") whose runs are taken; None for that choice.
+
+    Raises UserError where no run of that kind of device is known.
     """
 
     def best(same: Sequence[Job]) -> Job:
@@ -112,6 +120,9 @@ def with_recorded(
         by_device.setdefault(_device(next(iter(plan.values()))[0]), []).append(plan)
     of_each = (chosen(same) for same in by_device.values())  # that of this process first
     if finished:
+        of_each = [found for found in of_each if device in (None, _kind(next(iter(found.values()))[0]))]
+        if not of_each:
+            raise UserError(f"no run of {archive.table} on a {device} is known: leave --device out, or name its record")
         return max(of_each, key=lambda found: _tested(found, declaration.claims))
     found = chosen(plans)
     return found if len({_device(job) for jobs in found.values() for job in jobs}) == 1 else next(of_each)
@@ -125,6 +136,11 @@ def _tested(plan: Plan, claims: Sequence[Claim]) -> tuple[int, int]:
         rows = {model_of_row(row, complete) for row in (claim.treatment, claim.control) if row is not None}
         pairs += sum(all(of_seed) for of_seed in zip(*(complete[row] for row in rows), strict=True))
     return pairs, sum(map(sum, complete.values()))
+
+
+def _kind(job: Job) -> str:
+    """Return the kind of device of a training: "cpu", "gpu", ..."""
+    return str(_device(job) or "cpu").partition(":")[0]
 
 
 def _device(job: Job) -> Any:

@@ -72,6 +72,7 @@ def plan_table(
     cores: int | None = None,
     quick: bool = False,
     finished: bool = False,
+    device: str | None = None,
     archive: Archive | None = None,
     scored_by: ScoredBy = "this code",
 ) -> TablePlan:
@@ -86,7 +87,7 @@ def plan_table(
     if finished:
         settings += [setting for setting in settings_in(store) if setting not in settings]
     plans = [_planned(table, rows, hosts, seeds, store, threads) for threads in settings]
-    chosen = with_recorded([plan.jobs for plan in plans], archive, table.declaration, finished=finished)
+    chosen = with_recorded([plan.jobs for plan in plans], archive, table.declaration, finished=finished, device=device)
     trained = {name: [replace(job, scored_by=scored_by) for job in of_row] for name, of_row in chosen.items()}
     if finished:
         return _of_finished(replace(plans[0], jobs=trained, host_jobs={}), store)

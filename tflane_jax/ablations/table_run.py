@@ -105,6 +105,7 @@ def begin_table(
     cores: int | None = None,
     quick: bool = False,
     finished: bool = False,
+    device: str | None = None,
     archive: Archive | None = None,
     scored_by: ScoredBy = "this code",
 ) -> TableRun:
@@ -119,13 +120,16 @@ def begin_table(
         quick: few updates on few data, below `<out>/quick`: a smoke test, no result.
         finished: train nothing; the table is of the runs that are complete, with any number of cores and on any one
             device.
+        device: with `finished`, the kind of device whose runs are taken, "cpu" or "gpu"; None for the one that tests
+            the most.
         archive: recorded runs, which are taken instead of trained; None for none.
         scored_by: state of the code whose scores count where they are kept beside a run, see `Job`.
 
     Raises UserError for a table that must fail.
     """
     began, folder, interim = time.monotonic(), store_of(out, quick=quick).parent / table.name, None
-    how: dict[str, Any] = {"quick": quick, "finished": finished, "archive": archive, "scored_by": scored_by}
+    how: dict[str, Any] = {"quick": quick, "finished": finished, "device": device}
+    how |= {"archive": archive, "scored_by": scored_by}
     planned = plan_table(table, seeds, out, jobs=jobs, cores=cores, **how)
     plan = planned.jobs
     # Fewer seeds than the table has are an interim look at it.

@@ -73,6 +73,7 @@ def run(options: argparse.Namespace) -> int:
     from tflane_jax.ablations.table_run import begin_table, finish_table, train_tables
 
     how: dict[str, Any] = {"jobs": jobs, "cores": options.cores, "quick": options.quick, "finished": options.finished}
+    how["device"] = options.device
     how["scored_by"] = "any code" if options.earlier_scores else "this code"
     seeds = {table.name: options.seeds or range(2 if options.quick else table.seeds) for table in chosen}
     archives = {} if options.source is None else find_archives(options.source, [table.name for table in chosen])
@@ -157,6 +158,8 @@ def _check_together(options: argparse.Namespace) -> None:
         raise UserError(f"--quick runs are no results and never recorded: leave out {idle[0]} or --quick")
     if options.finished and (idle := [name for name in names if name in ("--jobs", "--cores")]):
         raise UserError(f"--finished trains nothing: leave out {idle[0]}")
+    if options.device is not None and not options.finished:
+        raise UserError("--device is about runs that exist: add --finished; trainings use the device that JAX finds")
     of_runs = ("--seeds", "--record", "--from", "--earlier-scores", "--finished", "--together")
     if options.search and (idle := [name for name in names if name in of_runs]):
         raise UserError(f"--search trains other runs than the table's, with its own seeds: leave out {idle[0]}")

@@ -162,6 +162,11 @@ def tables(commands) -> None:
         help="train nothing: make the table of the runs that are complete, whatever cores or GPU trained them",
     )
     parser.add_argument(
+        "--device",
+        choices=("cpu", "gpu"),
+        help="with --finished, take runs of this kind of device (default: that whose runs test the most)",
+    )
+    parser.add_argument(
         "--earlier-scores",
         action="store_true",
         help="keep scores of complete runs that an earlier state of the code measured (default: measure again)",

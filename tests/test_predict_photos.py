@@ -75,6 +75,15 @@ def test_files_that_cannot_be_read_are_recorded_and_the_others_predicted(predict
     assert report(tmp_path)["faults"] == []
 
 
+def test_a_photo_too_wide_for_opencv_stops_no_other(predict, tmp_path, capsys):
+    """Regression: an assertion of OpenCV ended the run."""
+    photo(tmp_path / "a.png")
+    cv2.imwrite(str(tmp_path / "panorama.png"), np.zeros((20, 33_000), np.uint8))
+    assert predict(".") == 2
+    assert "panorama.png has 33000 x 20 pixels, more than 32766 on a side" in capsys.readouterr().err
+    assert (len(report(tmp_path)["photos"]), report(tmp_path)["complete"]) == (1, True)
+
+
 def test_every_photo_has_a_picture_of_its_own(predict, tmp_path):
     (tmp_path / "more").mkdir()
     for name in ("a.png", "more/a.png", "more/a-2.png", "more/A.jpg"):

@@ -100,6 +100,17 @@ def test_every_key_frame_of_a_preset_has_its_whole_history(preset):
         assert flow.valid.any(-1).sum() == log.tracks.valid[frames].any(0).sum()
 
 
+def test_scenes_are_long_enough_for_a_longer_history():
+    """Regression: without history_hz, scenes had 20 frames before the first key frame, however many were asked for."""
+    data = WorldData(1, 1, 1)
+    for history, frames in ((5, 20), (40, 40)):
+        source = replace(data, example=replace(data.example, history=history)).source("val")
+        assert ProceduralDataset(source).history(source.world) == frames
+    source = replace(data, example=replace(data.example, history=40)).source("val")
+    flow = ProceduralDataset(source).example(0).traffic_flow
+    assert flow.valid[:, 0].any()
+
+
 def test_the_box_of_a_preset_lies_within_its_raster_and_its_map():
     for data in (WorldData.city(), WorldData.street()):
         ground, box = data.example.ground, data.example.range

@@ -14,13 +14,14 @@ from tests.datasets.test_road_maps import crossroads_features, write
 from tests.shared import shared_path
 from tflane_jax.datasets.base import ExampleConfig
 from tflane_jax.datasets.cache import fingerprint
+from tflane_jax.datasets.data_source import Choice
 from tflane_jax.datasets.examples import make_example
 from tflane_jax.datasets.leaves import example_leaves
 from tflane_jax.datasets.marker_observations import markers_of
 from tflane_jax.datasets.procedural import ProceduralConfig, ProceduralDataset
 from tflane_jax.datasets.real_maps import RealMapConfig, RealMapData, RealMapDataset, check_real_maps, sees
 from tflane_jax.datasets.recorded_logs import RECORDED_EXAMPLE, RecordedConfig, RecordedData, RecordedDataset
-from tflane_jax.datasets.sources import source_of
+from tflane_jax.datasets.sources import named_source, source_of
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import invert_pose, project, transform_points
 from tflane_jax.markers.simulation import MarkerConfig
@@ -99,6 +100,16 @@ def test_splits_take_the_logs_that_they_name_and_training_the_others():
     assert replace(data, without=("d",)).source("train").without == ("a", "b", "c", "d")
     assert source_of(recorded).name == "recorded"
     assert RecordedData(Path("x"), test=("b",)).source("train").without == ("b",)
+
+
+@pytest.mark.parametrize("given", [True, False])
+@pytest.mark.parametrize("test_on", ["maps", "recordings"])
+@pytest.mark.parametrize("name", ["real-maps", "recorded"])
+def test_the_data_of_a_split_are_on_its_own_logs(name, test_on, given):
+    """Regression: of the test split, the other kind of data was on all logs, those of the training too."""
+    data = RealMapData(Path("maps"), val_logs=("b",), test_logs=("c",), without=("d",), test_on=test_on)
+    found = named_source(name).choose(Choice("test", given, data.source("test"), Path("maps")))
+    assert (found.logs, type(found)) == (("c",), {"real-maps": RealMapConfig, "recorded": RecordedConfig}[name])
 
 
 def test_the_cache_key_changes_with_the_content_of_the_maps(maps, tmp_path):

@@ -274,6 +274,13 @@ def test_oncoming_lanes_say_more_than_what_a_map_tells(tmp_path):
     assert driving_side(read_lanes(write(tmp_path / "town.geojson", features)).map) == "right"
 
 
+def test_a_successor_that_is_listed_twice_is_one(tmp_path):
+    streets = [lane(i, (0, 20 * i), (200, 20 * i)) for i in range(11)]
+    streets[0]["properties"]["successors"] = [2, 2, "2"]
+    found = read_lanes(write(tmp_path / "town.geojson", streets)).map
+    assert found.segments[0].successors == (2,)
+
+
 def test_a_map_as_tables_are_exported(tmp_path):
     """Every geometry as Multi..., truth as 0 and 1, and what a feature does not have as null."""
     features = crossroads_features()
@@ -286,6 +293,8 @@ def test_a_map_as_tables_are_exported(tmp_path):
             properties |= {"intersection": int(properties["intersection"]), "bicycle": 0}
         properties |= {name: 1 for name in ("boundary", "crossing") if name in properties}
         one["properties"] = dict.fromkeys(columns | {"successors"}) | properties
+    nothing = dict.fromkeys(columns | {"successors"})
+    features += [one | {"properties": nothing | {"name": "sidewalk"}} for one in features[:1]]
     found = read_lanes(write(tmp_path / "town.geojson", features))
     assert (len(found.map.crossings), len(found.map.road_boundaries)) == (1, 1)
     for lane_, wanted in zip(found.map.segments.values(), plain.map.segments.values(), strict=True):
@@ -312,7 +321,8 @@ ARM = [(0, 0), (80, 0)]
     [
         ([], "holds no lane"),
         ([lane(1, *ARM), lane(1, *ARM)], "feature 1 has the lane id 1 of an earlier feature"),
-        ([lane(None, *ARM)], "feature 0: lane is None, expected an id"),
+        ([lane(None, *ARM)], "holds no lane"),
+        ([lane(None, *ARM, successors=[])], "feature 0: lane is None, expected an id"),
         ([lane(True, *ARM)], "feature 0: lane is True, expected an id"),
         ([lane(1, *ARM, successors=[2])], "feature 0: successor 2 is no lane of this file"),
         ([lane(1, *ARM, successors=2)], "feature 0: successors is 2, expected a list"),

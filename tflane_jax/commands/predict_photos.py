@@ -42,6 +42,8 @@ from tflane_jax.tasks.photo_lanes import PhotoLanes, PhotoReader
 _SEARCHED_FRAMES, _VIDEO_POINTS = 4, 20
 # Seconds between two states of predictions.json: a run of hours that is killed keeps almost all of its answers.
 _SAVED_EVERY = 10.0
+# OpenCV samples no larger pictures.
+_LARGEST_SIDE = 2**15 - 2
 
 
 def predict(trained: Run, paths: list[Path], options: argparse.Namespace) -> int:
@@ -116,6 +118,9 @@ class _Report:
 
 def _photo(reader: PhotoReader, path: Path, out: Path, camera: PhotoCamera | None) -> dict[str, Any]:
     photo = read_image(path)
+    if max(photo.shape) > _LARGEST_SIDE:
+        height, width = photo.shape[:2]
+        raise UserError(f"{path} has {width} x {height} pixels, more than {_LARGEST_SIDE} on a side: make it smaller")
     answer = reader.read(photo, camera)
     count = len(answer.lanes)
     save_photo(out, photo, answer.lanes, f"{path.name}: {counted(count, 'lane line')}")

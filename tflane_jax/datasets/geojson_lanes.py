@@ -57,13 +57,13 @@ def read_lanes(path: Path) -> RoadMap:
     for name, feature in read_features(path):
         geometry, properties = _record(feature, "geometry", name), _record(feature, "properties", name)
         kind = str(geometry.get("type"))
-        edge, walk = (properties.get(one) == 1 for one in ("boundary", "crossing"))  # text is OpenStreetMap's
-        if kind not in _DEPTHS or not (edge or walk or "lane" in properties):
+        given = {key: value for key, value in properties.items() if value is not None}
+        edge, walk = (given.get(one) == 1 for one in ("boundary", "crossing"))  # text is OpenStreetMap's
+        if kind not in _DEPTHS or not (edge or walk or given.keys() & {"lane", "successors"}):
             continue
         lines = _lines(geometry, kind, name)
-        given = {key: value for key, value in properties.items() if value is not None}
         if "lane" in given or not (edge or walk):
-            number = _identity(properties["lane"], name)
+            number = _identity(given.get("lane"), name)
             if "LineString" not in kind or len(lines) != 1:
                 raise UserError(f"{name}: lane {number} is a {kind} of {len(lines)} lines: a lane is one LineString")
             if number in lanes:
@@ -138,7 +138,7 @@ def _segments(lanes: Mapping[str, tuple[np.ndarray, Mapping[str, Any], str]]) ->
             wanted = [_identity(value, name) for value in listed]
             if unknown := set(wanted) - set(number):
                 raise UserError(f"{name}: successor {min(unknown)} is no lane of this file")
-            after[i] = tuple(number[value] for value in wanted if value != key)
+            after[i] = tuple(dict.fromkeys(number[value] for value in wanted if value != key))
     sides = boundaries({i: LaneOutline(line, None) for i, line in lines.items()}, {})
     segments = {}
     for key, (_, properties, name) in lanes.items():

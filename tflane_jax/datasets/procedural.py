@@ -108,7 +108,9 @@ class SimulatedDataset:
     def history(self, world: WorldConfig) -> int:
         """Return how many frames before a key frame a scene needs."""
         example = self.config.example
-        return HISTORY if example.history_hz is None else example.history * example.history_stride(world.rate_hz)
+        if example.history_hz is None:
+            return max(HISTORY, example.history)
+        return example.history * example.history_stride(world.rate_hz)
 
     def _frame(self, index: int) -> tuple[Log, int]:
         return self.simulated(self.scene_id(index)), index % self.config.world.keyframes
@@ -141,7 +143,7 @@ def scene_limits(world: WorldConfig, example: ExampleConfig, name: str) -> Rules
     stride = max(round(ratio), 1)
     divides = abs(ratio - stride) <= 0.05 * stride
     yield "example.history_hz", divides, f"{world.rate_hz:g} Hz ({name}rate_hz) divided by a whole number, or None"
-    history = HISTORY if example.history_hz is None else example.history * stride
+    history = max(HISTORY, example.history) if example.history_hz is None else example.history * stride
     most = max(world.frames - history, 0)
     allowed = f"at most {most}: scenes of {world.duration_s:g} s ({name}duration_s) have {world.frames} frames, "
     allowed += f"{history} of them before the first key frame (example.history, example.history_hz)"

@@ -204,7 +204,10 @@ def _choose(choice: Choice) -> RealMapConfig:
     assert choice.root is not None
     if isinstance(choice.configured, RealMapConfig):
         return replace(choice.configured, maps=choice.root)
-    return RealMapConfig(choice.root, split=choice.split, scenes=_SCENES, example=choice.configured.example)
+    # Recordings of a split (`RealMapData.test_on`) name its logs, too.
+    logs, without = getattr(choice.configured, "logs", ()), getattr(choice.configured, "without", ())
+    example = choice.configured.example
+    return RealMapConfig(choice.root, logs, without, split=choice.split, scenes=_SCENES, example=example)
 
 
 def _open(config: RealMapConfig, progress: bool) -> CachedDataset:

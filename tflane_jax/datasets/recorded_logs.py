@@ -127,11 +127,11 @@ def _choose(choice: Choice) -> RecordedConfig:
         return replace(configured, root=choice.root)
     example = replace(configured.example, cameras=None)
     # `--splits` is for exports: they refuse data without images, and say so.
-    if not choice.split_given or choice.option == "--splits" or choice.root.name == choice.split:
+    if choice.option == "--splits" or choice.root.name == choice.split:
         return RecordedConfig(choice.root, example=example)
     # Simulated scenes on maps (`RealMapConfig`) name the logs of a split too; training has all that others do not.
     logs, without = getattr(configured, "logs", ()), getattr(configured, "without", ())
-    if not (logs or (choice.split == "train" and without)):
+    if choice.split_given and not (logs or (choice.split == "train" and without)):
         raise UserError(
             f"nothing tells which recorded logs of {choice.root} are the split {choice.split}: leave --split out to "
             "take all of them, or name a folder that holds only the logs to take with --root"

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.datasets.test_geojson_lanes import crossroads_features, write
 from tests.datasets.test_nuscenes_scenes import content
-from tests.datasets.test_road_maps import crossroads_features, write
 from tests.fakes import FakeConfig, FakeDataset
 from tflane_jax.cli import build_parser, main
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 
-from tests.datasets.test_road_maps import crossroads_features, write
+from tests.datasets.test_geojson_lanes import crossroads_features, write
 from tests.tiny_run import fakes  # noqa: F401 (a fixture that is used by itself)
 from tflane_jax.ablations import workers
 from tflane_jax.ablations.jobs import Job, file_names

@@ -9,8 +9,8 @@ import pytest
 from scipy.spatial import KDTree
 
 from tests.datasets.small_argoverse2 import write_log
+from tests.datasets.test_geojson_lanes import crossroads_features, write
 from tests.datasets.test_nuscenes_scenes import content
-from tests.datasets.test_road_maps import crossroads_features, write
 from tests.shared import shared_path
 from tflane_jax.datasets.base import ExampleConfig
 from tflane_jax.datasets.cache import fingerprint

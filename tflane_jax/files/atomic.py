@@ -52,12 +52,7 @@ def replacing(path: Path | str) -> Iterator[Path]:
         yield temporary
         if not os.path.lexists(temporary):
             raise ValueError(f"nothing was written to {temporary}, so {path} cannot be replaced")
-        flush(temporary)
-        if temporary.is_dir() and path.is_dir():
-            _replace_folder(temporary, path)
-        else:
-            os.replace(temporary, path)
-        _flush_one(path.parent)
+        rename_flushed(temporary, path)
     except OSError as error:
         raise UserError(_message(path, temporary, error)) from error
     finally:
@@ -104,15 +99,15 @@ def flush(path: Path) -> None:
 
 
 def rename_flushed(written: Path, path: Path) -> None:
-    """Rename a folder, in the place of one of that name; a power failure leaves the whole of either there.
+    """Rename a file or folder, in the place of one of that name; a power failure leaves the whole of either there.
 
     After an OSError, what was there is there again.
     """
     flush(written)
-    if os.path.lexists(path):
+    if written.is_dir() and path.is_dir():
         _replace_folder(written, path)
     else:
-        written.rename(path)
+        os.replace(written, path)
     _flush_one(path.parent)
 
 

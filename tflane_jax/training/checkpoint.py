@@ -129,6 +129,8 @@ class Checkpoints:
             content = asdict(manifest) | {"files": _checksums(writing)}
             content["progress"] = {**manifest.progress, _CONFIG_SUM: _sum_of(manifest.config)}
             (writing / "manifest.json").write_text(json.dumps(content, indent=1), encoding="utf-8")
+            if not place.is_dir():
+                place.unlink(missing_ok=True)  # a file is no checkpoint
             rename_flushed(writing, place)
             self._drop_old()
         except OSError as error:

@@ -16,6 +16,7 @@ from tflane_jax.cli import main
 from tflane_jax.config import RunConfig, load_config
 from tflane_jax.config_overrides import apply_overrides
 from tflane_jax.datasets.real_maps import RealMapData
+from tflane_jax.datasets.sources import source_of
 from tflane_jax.errors import UserError
 from tflane_jax.own_modules import import_file
 from tflane_jax.training.records import read_records
@@ -115,6 +116,33 @@ def test_a_run_that_started_from_another_one_depends_on_it(tiny, compared, tmp_p
     assert again(tiny, tmp_path / "out", *start) == 2
     assert f"training.init_from: {tmp_path / 'hosts' / 'seed_0'} was trained anew since" in capsys.readouterr().err
     assert losses(tmp_path / "out" / "base" / "seed_0") == before
+
+
+def test_a_run_depends_on_the_files_that_it_was_trained_on(tiny, out, capsys, monkeypatch):
+    """As many scenes, but other ones: the configuration tells nothing."""
+    job, (manifest,) = (
+        job_of(tiny, out / "base" / "seed_0"),
+        (out / "base" / "seed_0").glob("checkpoints/*4/manifest.json"),
+    )
+    assert job.is_complete()
+    manifest.write_text(json.dumps(json.loads(manifest.read_text()) | {"progress": {"content": "scenes a, b"}}))
+
+    def read(content):
+        given = replace(source_of(job.config.data.source("train")), content=content)
+        monkeypatch.setattr("tflane_jax.ablations.jobs.source_of", lambda source: given)
+
+    read(lambda split: {"train": "scenes a, b"}[split.split])
+    assert job.is_complete()
+    read(lambda split: "scenes a, c")
+    assert not job.is_complete()
+    assert again(tiny, out) == 2
+    assert "the files of its training data have changed since" in capsys.readouterr().err
+
+    def gone(split):
+        raise UserError("no such folder")
+
+    read(gone)
+    assert job.is_complete()
 
 
 def test_names_that_would_share_a_folder_get_one_each(tiny, tmp_path):

@@ -259,3 +259,14 @@ def test_check_names_everything_that_is_missing(tmp_path):
 )
 def test_line_types(mark, expected):
     assert line_type(mark) == expected
+
+
+def test_the_content_of_logs_is_that_of_boxes_poses_and_maps(folder):
+    config = Argoverse2Config(folder.parent)
+    found = [argoverse2.SOURCE.content(config)]
+    for file in (folder / ANNOTATIONS, folder / POSES, *folder.glob("map/log_map_*.json")):
+        file.write_bytes(file.read_bytes() + b" ")
+        found.append(argoverse2.SOURCE.content(config))
+    shutil.copytree(folder, folder.parent / "log-b")
+    found.append(argoverse2.SOURCE.content(config))
+    assert len(set(found)) == len(found) == 5

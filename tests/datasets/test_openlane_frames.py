@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from tflane_jax.datasets.openlane_frames import list_frames
+from tflane_jax.datasets.openlane_frames import frames_content, list_frames
 from tflane_jax.errors import UserError
 
 
@@ -50,3 +50,13 @@ def test_the_folders_of_both_subsets_give_the_frames_of_one(tmp_path):
         (tmp_path / "train" / segment / "info" / "1.json").write_text(json.dumps({"sensor": {camera: {}}}))
     for subset, segments in (("A", ["1", "3"]), ("B", ["2", "3"])):  # 3 is damaged: reading it names the fault
         assert [key.segment for key in list_frames(tmp_path, "train", subset, "folders")] == segments
+
+
+def test_the_content_of_a_split_is_its_frames(tmp_path):
+    listed(tmp_path, "train", ("1", "2"), "data_dict_subset_A.json")
+    before = frames_content(tmp_path, "train", "A")
+    assert frames_content(tmp_path, "train", "A") == before
+    listed(tmp_path, "train", ("3", "4"), "data_dict_subset_A.json")
+    after = frames_content(tmp_path, "train", "A")
+    assert after != before
+    assert len({before, after, frames_content(tmp_path, "train", "A", "folders")}) == 3

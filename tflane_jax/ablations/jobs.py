@@ -2,7 +2,7 @@
 
 A run is identified by its whole resolved configuration, with exactly one seed, and by the thread setting of the process
 that trains it (`training.provenance.thread_setting`), because results depend on both. A run that starts from another
-one (`training.init_from`) also depends on that run's checkpoint.
+one (`training.init_from`) also depends on that run's checkpoint, and every run on the files of its training data.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from typing import Any, Literal
 from tflane_jax.ablations.recorded import RecordedRun
 from tflane_jax.config import RunConfig
 from tflane_jax.config_io import first_difference, to_json
+from tflane_jax.datasets.sources import source_of
 from tflane_jax.errors import UserError
 from tflane_jax.evaluation.results import EvaluationConfig
 from tflane_jax.run_checks import check_rate_factors, check_run
@@ -101,7 +102,7 @@ class Job:
                 return difference
             if difference := self._other_origin(start.get("init_from", [])):
                 return difference
-        return ""
+        return self._other_files()
 
     def _other_origin(self, recorded: Sequence[Mapping[str, Any]]) -> str:
         """Return which run of training.init_from is not the recorded one any more; "" if it is, or is gone."""
@@ -114,6 +115,16 @@ class Job:
             return ""
         changed = [new["run"] for old, new in zip(recorded, now, strict=True) if old["content"] != new["content"]]
         return f"training.init_from: {changed[0]} was trained anew since" if changed else ""
+
+    def _other_files(self) -> str:
+        """Return that files of the training data have changed since; "" if they have not, or nothing tells."""
+        checkpoints, split = Checkpoints(self.folder / "checkpoints"), self.config.data.source("train")
+        with contextlib.suppress(UserError):  # no files any more; a damaged checkpoint is told where its run is used
+            for step in checkpoints.steps()[-1:]:
+                trained_on = checkpoints.manifest(step).progress.get("content")  # earlier versions wrote down none
+                if trained_on and trained_on != source_of(split).content(split):
+                    return "the files of its training data have changed since"
+        return ""
 
     def start(self) -> Start:
         """Return how the training has to start."""

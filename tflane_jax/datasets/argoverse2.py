@@ -27,6 +27,7 @@ from tflane_jax.datasets.openlane_example import camera_views
 from tflane_jax.datasets.openlane_v2 import OpenLaneV2Config
 from tflane_jax.datasets.overlap import frame_drives
 from tflane_jax.datasets.photometric import PhotometricConfig
+from tflane_jax.datasets.road_maps import content_of, map_of_log
 from tflane_jax.datasets.streaming import StreamingConfig
 from tflane_jax.datasets.view_images import ImageConfig, ImageFit
 from tflane_jax.errors import UserError
@@ -271,4 +272,5 @@ SOURCE = DataSource(
     views=_pictures,
     cameras=lambda config: None if config.image is None else RING,
     tracks_hz=lambda config: 10.0,
+    content=lambda config: content_of([map_of_log(folder) for folder in find_logs(config.root)]),
 )

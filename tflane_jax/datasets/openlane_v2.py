@@ -28,6 +28,7 @@ from tflane_jax.datasets.openlane_frames import (
     SUBSETS,
     FrameFile,
     SubsetName,
+    frames_content,
     info_path,
     list_frames,
     read_frame,
@@ -343,4 +344,5 @@ SOURCE = DataSource(
     interval=lambda config: 0.5,
     cameras=lambda config: None if config.image is None else SUBSETS[config.subset].cameras,
     tracks_hz=lambda config: 0.0 if config.tracks is None else SUBSETS[config.subset].tracks_hz,
+    content=lambda config: frames_content(Path(config.root), config.split, config.subset, config.data_dict),
 )

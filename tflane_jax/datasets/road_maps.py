@@ -109,6 +109,12 @@ def _digest(file: Path, size: int, changed_ns: int) -> bytes:
         return hashlib.file_digest(stream, "sha256").digest()
 
 
+def map_of_log(folder: Path) -> MapFile:
+    """Return the map of a log of Argoverse 2, with its boxes and poses."""
+    maps = sorted((folder / "map").glob(MAP_PATTERN))
+    return MapFile(folder.name, (folder / ANNOTATIONS, folder / POSES, *maps), "argoverse2")
+
+
 def find_maps(root: Path) -> list[MapFile]:
     """Return the maps below a folder, or that of a single log, by name.
 
@@ -160,8 +166,7 @@ def _found(root: Path) -> Iterator[MapFile]:
         elif file.suffix == ".geojson":
             yield MapFile(file.stem, (file,), "geojson")
         elif file.name == ANNOTATIONS:
-            maps = sorted((file.parent / "map").glob(MAP_PATTERN))
-            yield MapFile(file.parent.name, (file, file.parent / POSES, *maps), "argoverse2")
+            yield map_of_log(file.parent)
         elif file.name == SCENE_TABLE:
             for name, files in scene_files(file):
                 yield MapFile(name, files, "nuscenes")

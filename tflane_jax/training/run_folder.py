@@ -107,7 +107,7 @@ def check_same_data(folder: Path, before: Mapping[str, Any], now: Mapping[str, A
     change = ""
     if before["examples"] != now["examples"]:
         change = f"was trained on {before['examples']} examples, and the training data have {now['examples']} now"
-    elif before["content"] != now["content"]:
+    elif before["content"] and before["content"] != now["content"]:  # "" where an earlier version knew none
         change = "was trained on other scenes or maps: the files of its training data have changed since"
     with agreed():
         if change:

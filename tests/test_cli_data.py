@@ -1,5 +1,6 @@
 """The command line: what a split holds, as numbers and as pictures."""
 
+import functools
 import json
 from pathlib import Path
 
@@ -10,6 +11,10 @@ from tests.datasets.test_geojson_lanes import crossroads_features, write
 from tests.datasets.test_nuscenes_scenes import content
 from tests.fakes import FakeConfig, FakeDataset
 from tflane_jax.cli import build_parser, main
+from tflane_jax.commands.sources import check_used, chosen_source
+from tflane_jax.config import load_config
+from tflane_jax.config_overrides import apply_overrides
+from tflane_jax.errors import UserError
 
 
 def test_data_stats_counts_lanes_and_traffic(capsys):
@@ -122,9 +127,36 @@ def test_data_show_draws_what_a_setting_of_the_world_does(tmp_path, capsys):
     for path in pictures:
         assert main([*show, path.stem, "--config", "tf_lane/toponet_tfm", "--out", str(path)]) == 0
     assert pictures[0].read_bytes() != pictures[1].read_bytes()
-    capsys.readouterr()
-    assert main([*show, "1", "--data", "street"]) == 2
-    assert "--data.world.mirrored changes the configuration's world, not --data street" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("data", "given", "unused"),
+    [
+        ("street", "--data.world.mirrored 1", True),
+        ("street", "--data.example.markers default --data.test 3", True),
+        ("street", "--data.example.lanes=30", True),  # the preset has its own
+        ("street", "--data.example.markers default --training.steps 3000", False),
+        ("procedural", "--data.test 3", False),
+        (None, "--data.train 3", False),
+    ],
+)
+def test_a_setting_without_effect_on_the_chosen_data_is_told(data, given, unused):
+    before, overrides = load_config("tf_lane/toponet_tfm"), given.split()
+    options, _ = build_parser().parse_known_args(["data", "stats", *(["--data", data] if data else [])])
+    choose = functools.partial(chosen_source, options=options)
+    if not unused:
+        check_used(overrides, before, apply_overrides(before, overrides), choose, data)
+        return
+    wrong = overrides[-1 if "=" in given else -2].partition("=")[0]
+    with pytest.raises(UserError, match=f"{wrong} changes the configuration's data, not --data street: leave one"):
+        check_used(overrides, before, apply_overrides(before, overrides), choose, data)
+
+
+@pytest.mark.parametrize("command", ["show", "stats", "export --config tf_lane/toponet --out x", "stats --beside city"])
+def test_commands_refuse_settings_that_have_no_effect(command, capsys):
+    """`stats` and `export` took them in silence, so that the answer was about other data than asked for."""
+    assert main(["data", *command.split(), "--data", "street", "--data.world.severity", "1"]) == 2
+    assert "--data.world.severity changes the configuration's data, not --data street" in capsys.readouterr().err
 
 
 @pytest.mark.slow

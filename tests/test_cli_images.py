@@ -125,7 +125,8 @@ def test_photos_of_any_size(trained, tmp_path, capsys):
     command = ["predict", str(trained), str(tmp_path), "--out", str(out)]
     assert main([*command, "--horizon", "30", "--threshold", "0"]) == 2  # the dot has no row 30
     assert "the horizon, row 30, is below a photo 1 pixels high" in capsys.readouterr().err
-    assert main([*command, "--threshold", "1.5"]) == 2
+    # Photos may also stand behind options.
+    assert main(["predict", str(trained), "--threshold", "1.5", "--out", str(out), str(tmp_path)]) == 2
     assert "--threshold 1.5: it must be a score from 0 to 1" in capsys.readouterr().err
     assert main(command) == 0
     assert "black.png: the photo is empty" in capsys.readouterr().err

@@ -63,6 +63,22 @@ def arguments(folder, out, **changed):
     return ["markers", "run", *(text for name, value in options.items() for text in (f"--{name}", str(value)))]
 
 
+@pytest.mark.parametrize(("lost", "of"), [("frames.json", "poses"), ("001.png", "images")])
+def test_a_drive_is_not_replaced_by_what_is_made_of_it(drive, tmp_path, capsys, lost, of):
+    """The images were overwritten by pictures, and the poses by frames.json, with exit code 0."""
+    folder = shutil.copytree(drive, tmp_path / "drive")
+    if of == "images":
+        (folder / "1.png").rename(folder / lost)
+        (folder / "poses.json").write_text((folder / "poses.json").read_text().replace('"1.png"', f'"{lost}"'))
+    else:
+        (folder / "poses.json").rename(folder / lost)
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    poses = folder / (lost if of == "poses" else "poses.json")
+    assert main(arguments(folder, folder, poses=poses)) == 2
+    assert f"{lost} is one of the files to read, and what is made from {poses} would" in capsys.readouterr().err
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+
+
 def test_a_drive_from_pixels_to_lanes(drive, tmp_path, capsys):
     out = tmp_path / "out"
     assert main(arguments(drive, out)) == 0

@@ -43,6 +43,25 @@ def test_detect_writes_poses_and_pictures(photos, tmp_path, capsys):
     assert (cv2.imread(str(out / second["picture"])) == cv2.imread(str(photos / "b.png"))).all()
 
 
+def test_no_photo_is_replaced_by_a_picture(photos, capsys):
+    other = (photos / "b.png").rename(photos / "000-a-markers.png")
+    before = other.read_bytes()
+    command = ["markers", "detect", str(photos / "a.png"), str(other), *INTRINSICS]
+    assert main([*command, "--out", str(photos)]) == 2
+    assert "000-a-markers.png is one of the files to read, and what is made from" in capsys.readouterr().err
+    assert other.read_bytes() == before
+    assert sorted(path.name for path in photos.iterdir()) == ["000-a-markers.png", "a.png"]
+
+
+def test_a_photo_whose_name_is_not_utf8_is_a_fault(photos, tmp_path, capsys):
+    (photos / "a.png").rename(photos / "K\udcfcste.png")
+    assert main(["markers", "detect", str(photos), *INTRINSICS, "--out", str(tmp_path / "out")]) == 2
+    assert "the name is not UTF-8; rename the file" in capsys.readouterr().err
+    written = json.loads((tmp_path / "out" / "detections.json").read_text())
+    assert [photo["file"] for photo in written["photos"]] == [str(photos / "b.png")]
+    assert [fault["file"] for fault in written["faults"]] == [f"{photos}/K\\udcfcste.png"]
+
+
 def two_boards(path, far=(15.0, 2.0, 2.0)):
     """Write a photo with two boards of id 42, the second one in the columns of its own."""
     near, second = (photo(AHEAD, {42: pose(*place)}) for place in ((9.0, -2.0, 2.0), far))

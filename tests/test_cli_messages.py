@@ -3,6 +3,7 @@
 import contextlib
 import errno
 import os
+import shlex
 import subprocess
 import sys
 
@@ -42,6 +43,38 @@ def test_a_full_output_is_one_line():
         ended = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
     said = "tflane: cannot print: No space left on device; make room or print elsewhere\n"
     assert (ended.returncode, ended.stderr) == (2, said)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="a shell that closes streams")
+def test_a_closed_output_is_no_error():
+    command = f"{shlex.quote(sys.executable)} -m tflane_jax.cli cache list"
+    ended = subprocess.run(f"{command} >&-", shell=True, capture_output=True, text=True, check=False)
+    assert (ended.returncode, ended.stderr) == (0, "")
+
+
+def test_a_stop_while_own_modules_are_imported_is_one_line(tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("TFLANE_IMPORT", "")
+    (tmp_path / "slow.py").write_text("raise KeyboardInterrupt")
+    assert main(["cache", "list", "--import", str(tmp_path / "slow.py")]) == 130
+    assert capsys.readouterr().err == "tflane: stopped\n"
+
+
+@pytest.mark.parametrize("command", ["data show --count 1", "tables tf_lane.1 --finished"])
+def test_a_working_directory_that_is_gone_is_one_line(command, tmp_path, monkeypatch, capsys):
+    (tmp_path / "gone").mkdir()
+    monkeypatch.chdir(tmp_path / "gone")
+    (tmp_path / "gone").rmdir()
+    assert main(command.split()) == 2
+    assert "the working directory is not there any more; change to another" in capsys.readouterr().err
+
+
+def test_options_are_not_abbreviated(capsys):
+    """`--imp MODULE` was taken and imported nothing."""
+    with pytest.raises(SystemExit, match="2"):
+        main(["cache", "list", "--imp", "no_such_module"])
+    assert "--imp" in capsys.readouterr().err
+    assert main(["train", "--over", "--config", "tf_lane/toponet"]) == 2
+    assert "unknown setting --over" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

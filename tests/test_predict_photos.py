@@ -101,7 +101,9 @@ def test_no_photo_is_replaced_by_a_picture(predict, tmp_path):
     for name in ("road.png", "road-lanes.png"):
         photo(tmp_path / "out" / name)
     before = (tmp_path / "out" / "road-lanes.png").read_bytes()
-    with pytest.raises(UserError, match=r"road-lanes.png is one of the photos .* for .*road.png would replace it"):
+    with pytest.raises(
+        UserError, match=r"road-lanes.png is one of the files to read, .* from .*road.png would replace it"
+    ):
         predict("out")
     assert (tmp_path / "out" / "road-lanes.png").read_bytes() == before
     assert not (tmp_path / "out" / "predictions.json").exists()

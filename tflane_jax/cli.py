@@ -16,6 +16,7 @@ import sys
 import threading
 import warnings
 from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from types import FrameType
 from typing import Any
 
@@ -32,34 +33,47 @@ _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command and return its exit code: 0 done, 2 an error of the user's, 128 + n ended by signal n."""
+    _open_closed()
     keep_freed_memory()
     if arguments is None:  # the program itself
         warnings.showwarning = OneLineWarnings(warnings.showwarning)
-    modules, others = take_imports(sys.argv[1:] if arguments is None else arguments)
-    try:
-        add_imports(modules)
-        look_in(None)
-        import_own()  # before names of own datasets are read
-    except UserError as error:
-        print(f"tflane: {error}", file=sys.stderr)
-        return 2
-    parser = build_parser()
-    options, rest = parser.parse_known_args(others)
-    if rest and not options.takes_overrides:
-        parser.error(f"unknown argument {rest[0]}: see tflane {options.command} --help")
     with _ending_on_sigterm(), _signals_not_lost():
-        code = _run_command(options, rest)
+        code = _ended(sys.argv[1:] if arguments is None else arguments)
     if arguments is None:  # the program itself
         leave(code)
     return code
 
 
-def _run_command(options: argparse.Namespace, rest: Sequence[str]) -> int:
+def _open_closed() -> None:
+    """Let output that was closed before the start (`tflane ... >&-`) go nowhere, instead of into the next file."""
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115 (open until the end)
+
+
+def _run(arguments: Sequence[str]) -> int:
+    """Read the arguments, run the command and return its exit code."""
+    modules, others = take_imports(arguments)
+    add_imports(modules)
+    look_in(None)
+    import_own()  # before names of own datasets are read
+    parser = build_parser()
+    options, rest = parser.parse_known_args(others)
+    if rest and not options.takes_overrides:
+        if not hasattr(options, "inputs") or any(argument.startswith("-") for argument in rest):
+            parser.error(f"unknown argument {rest[0]}: see tflane {options.command} --help")
+        options.inputs += map(Path, rest)  # of `tflane predict RUN --threshold 0.4 PHOTO`, which argparse leaves over
+        rest = []
+    command = getattr(importlib.import_module(f"tflane_jax.commands.{options.module}"), options.function)
+    code = (command(options, rest) if options.takes_overrides else command(options)) or 0
+    sys.stdout.flush()  # here, where its errors are told
+    return code
+
+
+def _ended(arguments: Sequence[str]) -> int:
+    """Run a command and return its exit code; errors that are the user's become a message."""
     try:
-        command = getattr(importlib.import_module(f"tflane_jax.commands.{options.module}"), options.function)
-        code = (command(options, rest) if options.takes_overrides else command(options)) or 0
-        sys.stdout.flush()  # here, where its errors are told
-        return code
+        return _run(arguments)
     except UserError as error:
         print(f"tflane: {error}", file=sys.stderr)
         return 2

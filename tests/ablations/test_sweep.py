@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from typing import Any
 
 import jax
 import pytest
@@ -9,7 +10,7 @@ import pytest
 from tests.ablations.test_compare import CONFIG
 from tests.models.cases import BASELINE
 from tests.parameters import random_params
-from tflane_jax.ablations.sweep import _tell_unfinished, sweep
+from tflane_jax.ablations.sweep import _given, _tell_unfinished, _tested, sweep
 from tflane_jax.cli import main
 from tflane_jax.errors import UserError
 from tflane_jax.runs import Run, save_weights
@@ -50,6 +51,15 @@ def test_every_run_is_evaluated_at_every_value(folder, tmp_path, monkeypatch, ca
         sweep(one, "data.world.severity", ["0"], tmp_path / "again", which="best")
     first = json.loads(again.with_suffix(".json").read_text())["meta"]["scores"]["one"][0][0]
     assert first == content["meta"]["scores"]["one"][0][0]
+
+
+def test_a_flag_is_swept_by_true_and_false():
+    """A flag takes no value on the command line, and a sweep needs values."""
+    setting, cameras = "data.example.cameras.markers", ("--data.example.cameras", "default")
+    for value in (True, False):
+        tested: Any = _tested(CONFIG, *_given(setting, str(value)), *cameras)
+        assert tested.data.example.cameras.markers is value
+    assert _given("data.world.severity", "0.5") == ("--data.world.severity", "0.5")
 
 
 def test_runs_that_are_not_finished_are_named(capsys):

@@ -35,7 +35,7 @@ def sweep(
     Args:
         models: run folder by name, or a folder that holds a run folder for each seed.
         setting: dotted name of a setting of the data; the others cannot change in a trained model.
-        values: of the setting, as on the command line.
+        values: of the setting, as on the command line; True and False of a flag.
         out: folder for `sweep.md`, `sweep.json` and `sweep.png`.
         overrides: other settings, `--name value`, for all.
         metrics: names ("group/name") of the scores to show; None shows those of `tflane compare`. The JSON file has
@@ -55,7 +55,7 @@ def sweep(
     runs = {name: runs_below(folder, which) for name, folder in models.items()}
     unfinished = _tell_unfinished([run for each in runs.values() for run in each]) if which == "last" else 0
     tested = {
-        value: {name: [_tested(run.config, f"--{setting}", value, *overrides) for run in runs[name]] for name in runs}
+        value: {name: [_tested(run.config, *_given(setting, value), *overrides) for run in runs[name]] for name in runs}
         for value in values
     }
     for value, by_name in tested.items():
@@ -107,6 +107,12 @@ def _tell_unfinished(runs: Sequence[Run]) -> int:
     for run in found:
         print(f"{run.name} made {run.step} of {run.config.training.steps} updates so far", file=sys.stderr)
     return len(found)
+
+
+def _given(setting: str, value: str) -> tuple[str, ...]:
+    """Return the arguments that give a setting its value; flags take none."""
+    part, dot, last = setting.rpartition(".")
+    return {"True": (f"--{setting}",), "False": (f"--{part}{dot}no-{last}",)}.get(value, (f"--{setting}", value))
 
 
 def _tested(config: RunConfig, *arguments: str) -> RunConfig:

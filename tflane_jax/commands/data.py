@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from tflane_jax.commands.sources import chosen_source, data_name
+from tflane_jax.commands.sources import check_used, chosen_source, data_name
 from tflane_jax.commands.views import with_images
 from tflane_jax.config import FrontViewData, RunConfig, load_config
 from tflane_jax.config_overrides import apply_overrides
@@ -33,15 +33,15 @@ _FORMAT = "argoverse2"  # of `data check`, by default
 def show(options: argparse.Namespace, overrides: Sequence[str]) -> int:
     """Draw samples of a split, and print counts of their content."""
     check_writable(options.out)
-    config = apply_overrides(RunConfig() if options.config is None else load_config(options.config), overrides)
-    worlds = [override for override in overrides if override.startswith("--data.world")]
-    if options.data is not None and worlds:
-        raise UserError(
-            f"{worlds[0]} changes the configuration's world, not --data {options.data}: leave one of them out"
-        )
-    if options.data is not None and sources.named_source(options.data).example is RoadImage:
-        config = _images(config)
-    source = chosen_source(config, options)
+    before = RunConfig() if options.config is None else load_config(options.config)
+    config = apply_overrides(before, overrides)
+    images = options.data is not None and sources.named_source(options.data).example is RoadImage
+
+    def choose(given: RunConfig) -> Any:
+        return chosen_source(_images(given) if images else given, options)
+
+    source = choose(config)
+    check_used(overrides, before, config, choose, options.data)
     if sources.source_of(source).example is RoadImage:
         return _show_images(source, config, options)
     dataset = sources.make_dataset(source)

@@ -11,8 +11,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from tflane_jax.commands.sources import chosen_source
-from tflane_jax.config import load_config
+from tflane_jax.commands.sources import check_used, chosen_source
+from tflane_jax.config import RunConfig, load_config
 from tflane_jax.config_overrides import apply_overrides
 from tflane_jax.datasets import sources
 from tflane_jax.datasets.argoverse2_export import export_tracks
@@ -32,8 +32,16 @@ from tflane_jax.world.roads.sd_map import sd_lines
 
 def run(options: argparse.Namespace, overrides: Sequence[str]) -> int:
     """Write the splits, check the written files, and print their counts."""
-    config = apply_overrides(load_config(options.config), overrides)
-    chosen = {split: chosen_source(config, options, split) for split in dict.fromkeys(options.splits)}
+    before = load_config(options.config)
+    config = apply_overrides(before, overrides)
+
+    splits: dict[Split, None] = dict.fromkeys(options.splits)
+
+    def choose(given: RunConfig) -> dict[Split, Any]:
+        return {split: chosen_source(given, options, split) for split in splits}
+
+    chosen = choose(config)
+    check_used(overrides, before, config, choose, options.data)
     tracks: Path | None = options.tracks
     _check_folders(options.out, tracks)
     _check_cameras(chosen)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from tflane_jax.commands.data_beside import beside
-from tflane_jax.commands.sources import chosen_source, data_name
+from tflane_jax.commands.sources import check_used, chosen_source, data_name
 from tflane_jax.config import RunConfig, load_config
 from tflane_jax.config_overrides import apply_overrides
 from tflane_jax.datasets import sources
@@ -22,8 +22,10 @@ from tflane_jax.tasks import spread
 
 def stats(options: argparse.Namespace, overrides: Sequence[str]) -> int:
     """Print the means and quantiles over examples spread evenly over a split."""
-    config = RunConfig() if options.config is None else load_config(options.config)
-    config = apply_overrides(config, overrides)
+    before = RunConfig() if options.config is None else load_config(options.config)
+    config = apply_overrides(before, overrides)
+    own = argparse.Namespace(**vars(options) | ({"openlane": None} if options.beside else {}))  # that may be of others
+    check_used(overrides, before, config, lambda given: chosen_source(given, own), options.data)
     if options.beside:
         return beside(config, options)
     if options.out is not None:

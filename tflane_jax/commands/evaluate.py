@@ -54,8 +54,6 @@ def run(options: argparse.Namespace) -> int:
     near = _nearness(trained, source, options.training_root)
     groups = _weather(source) if near is None else near.groups
     task = limited_task(trained, options)
-    protocol, rows = evaluate_run(trained, source, task=task, frame_groups=groups)
-
     name = f"{data_name(source, options)}-step{trained.step}"
     if options.max_instances is not None:
         name += f"-max_instances{options.max_instances}"
@@ -63,6 +61,11 @@ def run(options: argparse.Namespace) -> int:
         name += f"-traffic_{traffic.replace('-', '_')}"
     if (topology := trained.config.evaluation.topology) != "learned":
         name += f"-topology_{topology}"
+    # Published weights have no run folder: theirs are distinguished by name.
+    of_weights = Path("runs") / "evaluations" / f"{Path(trained.name).stem}-{name}"
+    stem = options.out or (of_weights if options.config else Path(trained.name) / "evaluations" / name)
+    check_stem(stem)
+    protocol, rows = evaluate_run(trained, source, task=task, frame_groups=groups)
     title = f"{trained.name}, {name}: {protocol}"
     print(format_table(rows, title=title))
     if near is not None:
@@ -77,9 +80,6 @@ def run(options: argparse.Namespace) -> int:
         "source": to_json(source),
         "near_training": None if near is None else near.sentence(),
     }
-    # Published weights have no run folder: theirs are distinguished by name.
-    of_weights = Path("runs") / "evaluations" / f"{Path(trained.name).stem}-{name}"
-    stem = options.out or (of_weights if options.config else Path(trained.name) / "evaluations" / name)
     paths = [*save_table(stem, rows, meta, title=title), *_save_edge_types(trained, source, stem)]
     if options.errors:
         paths += _save_errors(trained, task or trained.config.task, source, stem, meta)

@@ -36,7 +36,7 @@ from tflane_jax.datasets.marker_cache import search_views
 from tflane_jax.datasets.marker_observations import store_of_log
 from tflane_jax.datasets.native_views import fitted_views
 from tflane_jax.errors import UserError
-from tflane_jax.files.atomic import check_folder, replacing, write_bytes, write_json
+from tflane_jax.files.atomic import check_folder, check_replaces, replacing, write_bytes, write_json
 from tflane_jax.files.images import opencv
 from tflane_jax.geometry import PerceptionRange, invert_pose
 from tflane_jax.limits import check_settings
@@ -89,6 +89,7 @@ def run(options: argparse.Namespace) -> int:
         # A model that cannot read these images is refused before they are searched, which takes seconds each.
         fitted_views(drive.views(drive.frames[0], faults), model.source)
     times = [frame.timestamp_ns for frame in drive.frames]
+    _check_replaces(drive, options)
     check_rate(times, steps.interval if steps.remembers else None, steps.reader.config.residual_interval)
     make_folder(options.out)
     frames: list[dict[str, Any]] = []
@@ -134,7 +135,7 @@ def _follow(
         for number, frame in enumerate(progress_bar(drive.frames, desc="drive", unit="frame")):
             views = drive.views(frame, faults)
             step = steps.step(views, frame.timestamp_ns, frame.global_from_ego, search_views(views, detector))
-            picture = f"{number:03d}.png"
+            picture = _picture(number)
             save_drive_frame(
                 options.out / picture,
                 views,
@@ -150,6 +151,18 @@ def _follow(
             )
             record = {"timestamp_ns": frame.timestamp_ns, "picture": picture}
             frames.append(record | _record(step, views, names, options.threshold))
+
+
+def _picture(number: int) -> str:
+    return f"{number:03d}.png"
+
+
+def _check_replaces(drive: Drive, options: argparse.Namespace) -> None:
+    """Raise UserError if the pictures or frames.json would replace what is read."""
+    written = [options.out / name for name in ("frames.json", *map(_picture, range(len(drive.frames))))]
+    images = [image for frame in drive.frames for image in frame.images.values()]
+    poses: Path = options.poses
+    check_replaces(dict.fromkeys(written, poses), [poses, options.store, *images])
 
 
 def _model(folder: Path) -> DriveModel:

@@ -26,8 +26,9 @@ from jaxtyping import Float, UInt8
 
 from tflane_jax.commands.sources import make_folder
 from tflane_jax.errors import UserError
-from tflane_jax.files.atomic import check_folder, write_bytes, write_json
+from tflane_jax.files.atomic import check_folder, check_replaces, write_bytes, write_json
 from tflane_jax.files.images import check_centre, list_photos, opencv, read_image, undistorted
+from tflane_jax.files.wording import check_name, plain_name
 from tflane_jax.geometry.cameras import project
 from tflane_jax.limits import check_settings
 from tflane_jax.markers.curves import CurveConfig, Sighting, measure, summarise
@@ -75,18 +76,20 @@ def find(options: argparse.Namespace) -> int:
     if not abs(options.pitch) <= 90.0:
         raise UserError(f"--pitch is from -90 to 90 degrees, not {options.pitch:g}")
     intrinsics, pose = _intrinsics(options.intrinsics), camera_pose(options.height, np.deg2rad(options.pitch))
+    pictures = {path: f"{number:03d}-{path.stem}-markers.png" for number, path in enumerate(photos)}
+    check_replaces({options.out / name: path for path, name in pictures.items()}, photos)
     make_folder(options.out)
     rows, records, faults, twice = [], [], [], []
-    for number, path in enumerate(photos):
+    for path, picture in pictures.items():
         try:
+            check_name(path)
             photo = read_image(path)
             check_centre(path, photo, intrinsics)
         except UserError as error:
-            faults.append({"file": str(path), "error": str(error)})
+            faults.append({"file": plain_name(path), "error": str(error)})
             continue
         photo = undistorted(photo, intrinsics, distortion)
         found = detect(_views(photo, intrinsics, pose), config)
-        picture = f"{number:03d}-{path.stem}-markers.png"
         _write_picture(options.out / picture, photo, found, config.size, config.family, intrinsics, pose)
         here = [_record(found, k, intrinsics, pose) for k in np.flatnonzero(found.valid).tolist()]
         twice += _contradictions(path, here)
@@ -108,7 +111,7 @@ def find(options: argparse.Namespace) -> int:
     for fault in faults:
         print(f"tflane: {fault['error']}", file=sys.stderr)
     if faults:
-        print(f"tflane: photos without an answer: {len(faults)} of {len(photos)}, see above", file=sys.stderr)
+        print(f"tflane: photos without an answer: {len(faults)} of {len(pictures)}, see above", file=sys.stderr)
     return 2 if faults else 0
 
 

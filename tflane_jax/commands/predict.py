@@ -24,6 +24,8 @@ def run(options: argparse.Namespace) -> int:
     check_folder(options.out)  # before the weights are read and examples made
     if options.threshold is not None and not 0.0 <= options.threshold <= 1.0:
         raise UserError(f"--threshold {options.threshold:g}: it must be a score from 0 to 1")
+    if options.count is not None and options.count < 1:
+        raise UserError(f"--count {options.count}: nothing to predict")
     trained, photos = opened(options)
     of_images = isinstance(trained.config.task, LaneShapeTask)
     _check_inputs(options, photos)

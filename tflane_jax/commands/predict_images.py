@@ -34,8 +34,8 @@ def predict_split(trained: Run, options: argparse.Namespace) -> int:
     if root is not None and not Path(root).is_dir():
         raise UserError(f"there is no folder {root}: name that of the data with --root, or name photos or videos")
     dataset = sources.open_dataset(source)
-    if options.count < 1 or len(dataset) == 0:
-        raise UserError(f"nothing to predict: {len(dataset)} images, --count {options.count}")
+    if len(dataset) == 0:
+        raise UserError(f"nothing to predict: {dataset.name} has no images")
     indices = spread(len(dataset), options.count)
     examples = stack_examples([dataset.example(index) for index in indices])
     answers = predict_curves(trained.config.task, trained.params[0], examples, at_once=min(16, len(examples.image)))

@@ -64,11 +64,11 @@ def predict(trained: Run, options: argparse.Namespace) -> int:
     """Predict some examples of a split with the first seed, and write all files to --out."""
     task = limited_task(trained, options) or trained.config.task
     source = source_for(trained, options)
+    if options.cameras and not isinstance(plain := sources.make_dataset(source), SimulatedDataset):
+        raise UserError(f"--cameras renders scenes of the built-in world, and {plain.name} has none: leave it out")
     dataset = sources.open_dataset(source)
-    if options.count < 1 or len(dataset) == 0:
-        raise UserError(f"nothing to predict: {len(dataset)} examples, --count {options.count}")
-    if options.cameras and not isinstance(sources.make_dataset(source), SimulatedDataset):
-        raise UserError(f"--cameras renders scenes of the built-in world, and {dataset.name} has none: leave it out")
+    if len(dataset) == 0:
+        raise UserError(f"nothing to predict: {dataset.name} has no examples")
     indices = spread(len(dataset), options.count)
     examples, answer = predict_examples(task, trained.params[0], dataset, indices)
     infos = [dataset.info(index) for index in indices]

@@ -27,10 +27,10 @@ import numpy as np
 from tflane_jax.commands.sources import make_folder
 from tflane_jax.datasets.photos import PhotoCamera, Placement, fit_photo, misfits
 from tflane_jax.errors import UserError
-from tflane_jax.files.atomic import write_json
+from tflane_jax.files.atomic import check_replaces, write_json
 from tflane_jax.files.images import PHOTO_SUFFIXES, list_photos, opencv, read_image
 from tflane_jax.files.videos import VIDEO_SUFFIXES, read_frames, sample_frames, video_info, writing_video
-from tflane_jax.files.wording import check_name
+from tflane_jax.files.wording import check_name, plain_name
 from tflane_jax.plots.figure import new_figure
 from tflane_jax.plots.images import lanes_drawn, save_photo
 from tflane_jax.plots.tables import counted
@@ -58,7 +58,7 @@ def predict(trained: Run, paths: list[Path], options: argparse.Namespace) -> int
     if photos:
         new_figure()
     names = dict(zip(inputs, _names(inputs), strict=True))
-    _check_outputs({path: options.out / name for path, name in names.items()})
+    check_replaces({options.out / name: path for path, name in names.items()}, inputs)
     camera = None if options.focal is None and options.horizon is None else PhotoCamera(options.focal, options.horizon)
     reader = PhotoReader(trained.config.task, trained.params[0], options.threshold)
     make_folder(options.out)
@@ -105,8 +105,7 @@ class _Report:
             check_name(path)
             self.content[kind].append(read())
         except UserError as error:
-            name = str(path).encode(errors="backslashreplace").decode()
-            self.content["faults"].append({"file": name, "error": str(error)})
+            self.content["faults"].append({"file": plain_name(path), "error": str(error)})
         if time.monotonic() - self._saved > _SAVED_EVERY:
             self.save()
 
@@ -177,14 +176,3 @@ def _names(inputs: list[Path]) -> list[str]:
         taken.add(stem.lower())
         names.append(f"{stem}-lanes{suffix}")
     return names
-
-
-def _check_outputs(outputs: dict[Path, Path]) -> None:
-    """Raise UserError if the picture of one input would replace another input."""
-    inputs = {path.resolve() for path in outputs}
-    for path, out in outputs.items():
-        if out.resolve() in inputs:
-            raise UserError(
-                f"{out} is one of the photos and videos to read, and the answer for {path} would replace it: choose "
-                "another folder as --out, or leave that file out"
-            )

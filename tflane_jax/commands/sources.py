@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import warnings
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -142,6 +143,37 @@ def chosen_source(config: RunConfig, options: argparse.Namespace, split: Split |
     if source is not openlane_v2.SOURCE:
         raise UserError("--data-dict chooses the frames of OpenLane-V2: other data do not read it")
     return replace(found, data_dict=options.data_dict)
+
+
+def check_used(
+    overrides: Sequence[str], before: RunConfig, config: RunConfig, choose: Callable[[RunConfig], Any], data: str | None
+) -> None:
+    """Raise UserError for a setting of the configuration's data that --data leaves without effect.
+
+    Args:
+        overrides: `--name value`, as given.
+        before: the configuration without them.
+        config: the configuration with them.
+        choose: returns what is chosen by --data from a configuration.
+        data: of --data; without it, the data are the configuration's.
+    """
+    chosen = None if data is None else choose(config)
+    for text in overrides if data is not None else ():
+        path = text.partition("=")[0].removeprefix("--").replace("-", "_").split(".")
+        if not text.startswith("--data.") or (without := _with_part(config, before, path)) == config:
+            continue
+        if choose(without) == chosen:
+            raise UserError(
+                f"{text.partition('=')[0]} changes the configuration's data, not --data {data}: leave one of them out"
+            )
+
+
+def _with_part(config: Any, other: Any, path: Sequence[str]) -> Any:
+    """Return a configuration with the setting at `path` (or flag, `a.no_b`) as another one has it."""
+    name = path[0] if hasattr(config, path[0]) else path[0].removeprefix("no_")
+    own, its = getattr(config, name), getattr(other, name)
+    whole = len(path) == 1 or type(own) is not type(its)
+    return replace(config, **{name: its if whole else _with_part(own, its, path[1:])})
 
 
 def source_for(run: Run, options: argparse.Namespace) -> Any:

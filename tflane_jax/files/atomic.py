@@ -16,7 +16,7 @@ import os
 import re
 import secrets
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -127,13 +127,23 @@ def check_writable(path: Path | str) -> None:
     _check_name(path)
     if os.path.isdir(path):
         raise UserError(f"cannot write {path}: it is a folder; choose another path")
-    _check_place(path, _temporary(path), path.absolute().parents)
+    _check_place(path, _temporary(path), _absolute(path).parents)
 
 
 def check_folder(folder: Path | str) -> None:
     """Raise UserError if files cannot be written into a folder, which need not exist, as `check_writable` does."""
     folder = Path(folder)
-    _check_place(folder, folder, (folder.absolute(), *folder.absolute().parents))
+    _check_place(folder, folder, ((place := _absolute(folder)), *place.parents))
+
+
+def _absolute(path: Path) -> Path:
+    try:
+        return path.absolute()
+    except FileNotFoundError:
+        raise UserError(
+            f"cannot write {path}: the working directory is not there any more; change to another, or give an absolute "
+            "path"
+        ) from None
 
 
 def _check_place(path: Path, probe: Path, above: Sequence[Path]) -> None:
@@ -152,6 +162,23 @@ def _check_place(path: Path, probe: Path, above: Sequence[Path]) -> None:
         raise UserError(f"cannot write {path}: {found} is no folder; choose another path")
     if not os.access(found, os.W_OK | os.X_OK):
         raise UserError(f"cannot write {path}: no right to write in {found}; choose another path")
+
+
+def check_replaces(outputs: Mapping[Path, Path], inputs: Iterable[Path], option: str = "--out") -> None:
+    """Raise UserError if a file to write would replace one to read.
+
+    Args:
+        outputs: for each file to write, the file that it is made from.
+        inputs: all files to read.
+        option: that names the folder to write to.
+    """
+    read = {path.resolve() for path in inputs}
+    for path, source in outputs.items():
+        if path.resolve() in read:
+            raise UserError(
+                f"{path} is one of the files to read, and what is made from {source} would replace it: choose another "
+                f"folder as {option}"
+            )
 
 
 def check_stem(stem: Path | str) -> None:

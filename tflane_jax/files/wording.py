@@ -37,6 +37,11 @@ def check_name(path: Path) -> None:
         raise UserError(f"cannot read {str(path)!a}: the name is not UTF-8; rename the file") from None
 
 
+def plain_name(path: Path) -> str:
+    """Return a name for reports, in which bytes that are not UTF-8 are escaped."""
+    return str(path).encode(errors="backslashreplace").decode()
+
+
 def kind(value: Any) -> str:
     """Return of which type a value is, as the end of a sentence."""
     return "missing (null)" if value is None else f"of type {type(value).__name__}"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 OVERRIDES = """Any setting of the configuration can be changed by its dotted name, for example --optim.lr 1e-3.
 `tflane train --config FILE --help` lists them all with their values."""
@@ -33,7 +34,13 @@ class SourceName:
 
 
 class CommandParser(argparse.ArgumentParser):
-    """A parser whose help lists the data sources. It imports them, which takes a second, only to print help."""
+    """A parser whose help lists the data sources. It imports them, which takes a second, only to print help.
+
+    Options have one spelling: an abbreviated --import would not be found by `own_modules.take_imports`.
+    """
+
+    def __init__(self, *positional: Any, allow_abbrev: bool = False, **named: Any):
+        super().__init__(*positional, allow_abbrev=allow_abbrev, **named)
 
     def format_help(self) -> str:
         """Return the help text."""

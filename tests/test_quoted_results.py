@@ -31,7 +31,7 @@ COLUMNS = {
     "DET_l": "all/DET_l",
     "TOP_ll": "all/TOP_ll",
     "recall": "all/recall",
-    **{name: f"all/{name}" for name in ("mAP", "AP_ls", "AP_ped", "TOP_lsls", "Accuracy", "FP", "FN")},
+    **{name: f"all/{name}" for name in ("mAP", "AP_ls", "AP_ped", "TOP_lsls", "OLS", "DET_t", "Accuracy", "FP", "FN")},
     "hidden, driven along": "hidden+traffic/recall",
     "recall, hidden lanes that vehicles drove along": "hidden+traffic/recall",
     "hidden, no vehicle near": "hidden-traffic/recall",

@@ -5,8 +5,7 @@
 Every row starts from the host of its own seed and makes the same number of updates on clips of four frames, half a
 second apart, with or without a prior; "toponet" and "bevformer_detr" are the hosts, tuned as long. Detections are
 simulated, except in "pixels": there a detector reads the boards in native images, which are searched once and kept with
-the examples. The rows without a prior are trained (docs/cameras.md); of the paper's system one seed was, as a first
-look (docs/markers.md).
+the examples. docs/markers.md says which rows are trained.
 """
 
 import functools

@@ -323,7 +323,7 @@ def _save_summary(
             "declared seeds": len(declared.seeds),
             "steps": {name: jobs[0].config.training.steps for name, jobs in trained.items() if jobs},
             "cores of a run": sorted({job.threads["cores"] for job in runs}),
-            "commits": [*commits(runs), *sorted({text for job in runs for text in _measured_elsewhere(job)})],
+            "commits": [*commits(runs), *_measured_elsewhere(runs)],
             "devices": sorted({device for job in runs for device in facts(job).devices}),
             "core minutes of a run": row_minutes(trained),
             "rows": _rows(table, results),
@@ -333,10 +333,12 @@ def _save_summary(
     )
 
 
-def _measured_elsewhere(job: Job) -> set[str]:
-    """Return by which states of the code a run was measured, in words: by other ones, of a recorded run by any."""
-    found = [measure(job, config, which) for config, which in evaluations(job)]
-    codes = {measured.code[:9] for measured in found if measured is not None}
-    if job.recorded is None:
-        codes.discard(code_digest()[:9])
-    return {f"measured by code of digest {code}" for code in codes}
+def _measured_elsewhere(runs: Sequence[Job]) -> list[str]:
+    """Return by which states of the code runs were measured, in words: by other ones, recorded runs by any."""
+    found = [(job, measure(job, config, which)) for job in runs for config, which in evaluations(job)]
+    codes = {
+        measured.code[:9]
+        for job, measured in found
+        if measured is not None and (job.recorded is not None or measured.code != code_digest())
+    }
+    return [f"measured by code of digest{'s' * (len(codes) > 1)} {' and '.join(sorted(codes))}"] if codes else []

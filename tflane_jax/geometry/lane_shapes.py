@@ -5,7 +5,7 @@ unit:
 
     u = k'' / (v - f'')^2 + m'' / (v - f'') + n' + b'' v - b'''                                                 (7)
 
-docs/gtn_lane.md says how it follows from Eq. (5) and (6).
+tests/geometry/ground_curves.py has the steps from Eq. (5) and (6).
 """
 
 from __future__ import annotations

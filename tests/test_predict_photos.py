@@ -168,6 +168,19 @@ def test_a_run_that_is_stopped_keeps_its_answers(predict, tmp_path):
     assert not found["complete"]
 
 
+def test_a_video_that_was_cut_off_is_told(predict, tmp_path):
+    path = tmp_path / "drive.avi"
+    video = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 5, (64, 48))
+    for i in range(50):
+        video.write(np.full((48, 64, 3), 4 * i, np.uint8))
+    video.release()
+    for part, said in ((1.0, ""), (0.6, "of 50 frames could be read: is the file whole?")):
+        path.write_bytes(path.read_bytes()[: int(part * path.stat().st_size)])
+        assert predict("drive.avi", horizon=24.0) == 0
+        assert report(tmp_path)["videos"][0]["warning"].endswith(said)
+        assert bool(report(tmp_path)["videos"][0]["warning"]) == bool(said)
+
+
 def test_a_video_says_that_its_horizon_cannot_be_right(predict, tmp_path):
     video = cv2.VideoWriter(str(tmp_path / "drive.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 5, (64, 48))
     for _ in range(3):

@@ -9,12 +9,13 @@ from hypothesis import strategies as st
 
 from tflane_jax.errors import UserError
 from tflane_jax.geometry.cameras import ground_points, project
+from tflane_jax.world.front_view.ground import image_columns
 from tflane_jax.world.front_view.lines import ROW_FRACTIONS, label_lines, marked_lines
 from tflane_jax.world.front_view.road import WHITE, Stripe
 from tflane_jax.world.front_view.roadside import Roadside
 from tflane_jax.world.front_view.traffic import FrontTrafficConfig
 from tflane_jax.world.front_view.views import FrontWorldConfig, draw_front_scene, front_view, render, scene_lines
-from tflane_jax.world.render.camera import PinholeCamera
+from tflane_jax.world.render.camera import PinholeCamera, lift
 from tflane_jax.world.render.weather import Sky
 from tflane_jax.world.roads.curves import ReferenceLine
 
@@ -45,6 +46,32 @@ def test_labels_are_the_projection_of_the_lines(scene_id):
         np.testing.assert_allclose(points[:, 1], ROW_FRACTIONS, rtol=1e-6)
         assert ((u >= 0.0) & (u < 1280.0)).all()
         assert min(np.abs(u - c[there]).max() for c in columns if not np.isnan(c[there]).any()) < 0.5
+
+
+@pytest.mark.parametrize("radius", [(80.0, 90.0), (20.0, 25.0)])
+def test_a_line_that_turns_back_is_followed_until_there(radius):
+    """Beyond, rows repeat: interpolation gave columns far from the paint, or no line at all."""
+    road = replace(CLEAN.road, radius=radius, straight=0.0)
+    for scene in (draw_front_scene(scene_id, replace(CLEAN, road=road)) for scene_id in range(5)):
+        rows, found = np.arange(scene.camera.height) + 0.5, 0
+        for line in scene.road.lines:
+            columns, stations = image_columns(scene.camera, scene.road, line, rows, 400.0)
+            # Nearer, it is seen that chords of a metre stand for the curve; at 8 m they are up to a pixel off.
+            seen = (columns > 0.0) & (columns < scene.camera.width) & (stations > 8.0)
+            ground = scene.road.at(stations[seen], np.interp(stations[seen], scene.road.axis.s, line))
+            pixels, _ = scene.camera.image_of(lift(ground))
+            np.testing.assert_allclose(pixels, np.stack([columns, rows], -1)[seen], atol=2.0)
+            assert (np.diff(stations[seen]) < 0.0).all()
+            found += seen.sum()
+        assert found > 50
+
+
+@pytest.mark.parametrize("camera", [{"centre": 600.0}, {"pitch": (-40.0, -40.0)}, {"pitch": (100.0, 100.0)}])
+def test_a_camera_may_look_anywhere(camera):
+    """Regression: a camera whose horizon is below its last row ended in numpy's traceback."""
+    config = replace(CLEAN, camera=replace(CLEAN.camera, **camera))
+    views = [front_view(scene_id, config) for scene_id in range(4)]
+    assert all(np.isfinite(view.image).all() for view in views)
 
 
 @settings(max_examples=15)

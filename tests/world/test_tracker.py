@@ -66,6 +66,14 @@ def test_small_sizes(frames, count):
     assert reported.valid.all()
 
 
+def test_no_size_is_negative():
+    """However large the noise: boxes are turned round and drawn, and their sizes are tokens."""
+    actors = actors_at(still([(9.0, 3.0 * k) for k in range(20)], 20), [CAR] * 20)
+    sizes = run(actors, replace(TrackerConfig(), size_noise=1.0, drop=0.5, coast=0)).size
+    assert (sizes >= 0.1 * np.array(CAR) * (1 - 1e-9)).all()
+    assert (sizes < 0.2 * np.array(CAR)).any()
+
+
 def test_same_stream_same_bits():
     rng = np.random.default_rng(1)
     actors = actors_at(rng.uniform(-60, 60, (40, 12, 2)), [CAR] * 12)

@@ -42,6 +42,8 @@ from tflane_jax.tasks.photo_lanes import PhotoLanes, PhotoReader
 _SEARCHED_FRAMES, _VIDEO_POINTS = 4, 20
 # Seconds between two states of predictions.json: a run of hours that is killed keeps almost all of its answers.
 _SAVED_EVERY = 10.0
+# Least fraction of the frames in its header that a whole video has; headers are not exact.
+_WHOLE = 0.95
 # OpenCV samples no larger pictures.
 _LARGEST_SIDE = 2**15 - 2
 
@@ -148,8 +150,10 @@ def _video(reader: PhotoReader, path: Path, out: Path, camera: PhotoCamera | Non
             writer.add(lanes_drawn(frame, answer.lanes))
             frames.append(_plain(answer, _VIDEO_POINTS))
             doubtful += answer.warning not in ("", of_all)
-    warning = f"{doubtful} of {len(frames)} frames are doubtful or empty" if doubtful else ""
-    warning = "; ".join(filter(None, (of_all, warning)))
+    few = f"{doubtful} of {len(frames)} frames are doubtful or empty" if doubtful else ""
+    cut = len(frames) < _WHOLE * info.frames
+    lost = f"only {len(frames)} of {info.frames} frames could be read: is the file whole?" if cut else ""
+    warning = "; ".join(filter(None, (of_all, few, lost)))
     return head | {"video": out.name, "view": _plain_view(view), "warning": warning, "frames": frames}
 
 

@@ -23,6 +23,12 @@ PHOTO_SUFFIXES = (".bmp", ".gif", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".we
 _NAMED = 3  # files in a message
 # Place of the principal point, as fractions of width and height, outside of which an image is of another size.
 _SCALED = (0.3, 0.75)
+# Largest value of a 16-bit image that is as good as black in 8 bits.
+_DARK = 2**14
+
+
+class DarkImageWarning(UserWarning):
+    """A 16-bit image uses few of its bits."""
 
 
 def opencv() -> ModuleType:
@@ -95,7 +101,8 @@ def read_image(path: Path) -> UInt8[np.ndarray, "h w 3"]:
     """Return a photo as 8-bit RGB, turned upright as its EXIF record says; transparency is dropped.
 
     A JPEG decodes to the pixels of `cv2.imread`, with the channels turned round. Raises UserError where the file cannot
-    be read, is empty, cut off, or no image of a known format.
+    be read, is empty, cut off, or no image of a known format with 8 or 16 bits a channel. Warns of 16-bit images that
+    use few of their bits.
     """
     cv2, path = opencv(), Path(path)
     if fault := unreadable(path):
@@ -109,13 +116,23 @@ def read_image(path: Path) -> UInt8[np.ndarray, "h w 3"]:
         raise UserError(f"{path} is empty: copy or download the image again")
     try:
         with quiet_opencv():
-            image = cv2.imdecode(data, cv2.IMREAD_COLOR)
+            image = cv2.imdecode(data, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
     except cv2.error as error:
         raise UserError(f"cannot read the image {path}: {error.err}") from None
-    if image is None:
+    if image is None or image.dtype not in (np.uint8, np.uint16):
         raise UserError(
-            f"{path} is damaged or no image of a known format: open it in an image viewer and save it as JPEG or PNG"
+            f"{path} is damaged or no image of a known format, with 8 or 16 bits a channel: open it in an image viewer "
+            "and save it as JPEG or PNG"
         )
+    if image.dtype == np.uint16:
+        if image.max(initial=0) < _DARK:
+            warnings.warn(
+                f"{path} uses {int(image.max(initial=0)).bit_length()} of its 16 bits, so that it is almost black: "
+                "stretch its values to all of them",
+                DarkImageWarning,
+                stacklevel=2,
+            )
+        image = (image >> 8).astype(np.uint8)
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 

@@ -13,6 +13,7 @@ from typing import Literal
 
 import numpy as np
 
+from tflane_jax.errors import UserError
 from tflane_jax.scene.marker_patterns import MarkerFamily
 from tflane_jax.scene.terrain import Terrain
 
@@ -217,5 +218,11 @@ class Log:
 
     @property
     def rate_hz(self) -> float | None:
-        """Track frames per second, from the median interval; None for a log of fewer than two frames."""
-        return None if len(self.timestamps_ns) < 2 else 1e9 / float(np.median(np.diff(self.timestamps_ns)))
+        """Track frames per second, from the median interval; None for a log of fewer than two frames.
+
+        Raises UserError where a frame is not later than the one before it.
+        """
+        intervals = np.diff(self.timestamps_ns)
+        if len(wrong := np.flatnonzero(intervals <= 0)):
+            raise UserError(f"log {self.name}: frame {wrong[0] + 1} is not later than the frame before it")
+        return None if len(intervals) == 0 else 1e9 / float(np.median(intervals))

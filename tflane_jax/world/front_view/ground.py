@@ -56,7 +56,8 @@ def look_at_ground(camera: PinholeCamera, axis: ReferenceLine) -> Ground:
     # Farther points are moved to distance FAR along their rays, so that all stations lie on the axis.
     s, offset = road_coordinates(axis, xy * np.minimum(1.0, FAR / np.maximum(distance, 1e-9))[:, None])
     coarse = np.stack([s, offset]).reshape(2, *pixels.shape[:2]).astype(np.float32)
-    length = np.abs(np.gradient(coarse[0, :, len(knots) // 2]))
+    middle = coarse[0, :, len(knots) // 2]
+    length = np.abs(np.gradient(middle)) if len(rows) > 1 else np.full(1, FAR)  # of a camera that looks at the sky
     fine = _between_columns(coarse)[..., : camera.width]
     depth = camera.ground_depth(np.arange(camera.width) + 0.5, rows, _BEYOND)
     return Ground(first, fine[0], fine[1], depth, np.maximum(length, 1e-3))
@@ -107,7 +108,7 @@ def image_columns(
         rows: v, pixels, ascending.
         reach: the line ends at this station.
 
-    Both results are NaN in rows that the line does not reach.
+    Both results are NaN in rows that the line does not reach before it turns back towards the camera.
     """
     axis = road.axis
     keep = axis.s <= reach
@@ -117,9 +118,11 @@ def image_columns(
         end = road.at(np.array([reach]), np.interp([reach], axis.s, offset))
         ground, s = np.concatenate([ground, end]), np.append(s, reach)
     pixels, depth = camera.image_of(lift(ground))
-    seen = depth > 1.0
-    # Farther points are higher in the image.
-    u, v, s = pixels[seen, 0][::-1], pixels[seen, 1][::-1], s[seen][::-1]
+    pixels, s = pixels[depth > 1.0], s[depth > 1.0]
+    # Farther points are higher in the image, up to where the road turns back.
+    back = np.flatnonzero(np.diff(pixels[:, 1]) > 1e-9)
+    until = back[0] + 1 if len(back) else len(s)
+    u, v, s = pixels[:until, 0][::-1], pixels[:until, 1][::-1], s[:until][::-1]
     if len(v) < 2:
         return np.full(len(rows), np.nan), np.full(len(rows), np.nan)
     # Along the road, rows are proportional to inverse distances, so interpolate stations there.

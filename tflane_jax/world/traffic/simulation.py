@@ -32,8 +32,8 @@ class TrafficConfig:
     """Amount and composition of the traffic.
 
     Attributes:
-        vehicles_per_metre: mean density on a lane in free flow; 0: no moving motor vehicles but the
-            ego.
+        vehicles_per_metre: mean density on a lane in free flow, up to what junctions let in: above about 0.05 it
+            changes little; 0: no moving motor vehicles but the ego.
         category_share: moving motor vehicles by category.
         bicycles_per_metre: on bike lanes; slow outer lanes get half of the corresponding fraction of their traffic.
         parked_share: fraction of the parking slots that are occupied.
@@ -43,7 +43,8 @@ class TrafficConfig:
         ego_passes_s: time at which the ego vehicle passes the middle of its route, so the central feature of the roads,
             up to 20 m and what traffic allows, seconds after the first frame; None starts it anywhere on the route.
         variety: how much the amounts differ between scenes: moving vehicles, parked vehicles and pedestrians of a
-            scene are each multiplied by exp(variety * z - variety^2 / 2), z standard normal, so that the means stay.
+            scene are each multiplied by exp(variety * z - variety^2 / 2), z standard normal, so that the means stay
+            (of moving vehicles, what is asked for).
         green_wave: probability that the first light on the ego vehicle's way turns green about when the log begins.
         range: distance from the ego vehicle up to which road users exist, metres; the tracker has its own.
         warm_up_s: time for which traffic settles before the log begins, seconds: at least 3.2, when the ego vehicle

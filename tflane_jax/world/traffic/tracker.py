@@ -110,8 +110,12 @@ def track(
 
     identity = _identities(detected | coasting)
     identity = _switch(rng, identity, actors, config, rate_hz)
-    size_noise = 1.0 + rng.normal(size=(identity.max(initial=-1) + 1, 3)) * config.size_noise
+    size_noise = np.maximum(1.0 + rng.normal(size=(identity.max(initial=-1) + 1, 3)) * config.size_noise, _LEAST_SIZE)
     return _table(identity, seen, yaw, coasting, actors, size_noise)
+
+
+# Of a tracked size, as a fraction of the true one.
+_LEAST_SIZE = 0.1
 
 
 def visible_share(

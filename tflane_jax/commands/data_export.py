@@ -46,7 +46,7 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> int:
     _check_folders(options.out, tracks)
     _check_cameras(chosen)
     driven = {} if tracks is None else _driven(chosen)
-    datasets = {split: sources.open_dataset(source) for split, source in chosen.items()}
+    datasets: dict[Split, Any] = {split: sources.open_dataset(source) for split, source in chosen.items()}
     out = export_openlane_v2(datasets, options.out, images=options.images, sd_maps=_sd_maps(chosen))
     if tracks is not None:
         if subset_of(out) == "A":

@@ -127,11 +127,14 @@ def test_other_worlds_folders_and_splits_have_other_names(source, given, name):
     ("folder", "config", "title"),
     [
         ("runs/tfm", "tf_lane/toponet_tfm", "tfm, step 3"),
+        (".", "tf_lane/toponet_tfm", "tfm, step 3"),
         ("runs/runs/b1d907781b71ba6b", "tf_lane/toponet_tfm", "TopoNet + traffic flow, step 3"),
         ("runs/runs/b1d907781b71ba6b", "gtn_lane/gtn", "Lstr + GtnEncoder, step 3"),
     ],
 )
-def test_pictures_of_a_run_in_a_store_name_its_model(folder, config, title):
+def test_pictures_of_a_run_in_a_store_name_its_model(folder, config, title, tmp_path, monkeypatch):
+    (tmp_path / "tfm").mkdir()
+    monkeypatch.chdir(tmp_path / "tfm")
     assert model_title(Run(folder, load_config(config), 3, ())) == title
 
 

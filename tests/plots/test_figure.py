@@ -5,6 +5,7 @@ import io
 import numpy as np
 import pytest
 
+from tflane_jax.errors import UserError
 from tflane_jax.plots import add_legend, new_figure, style
 from tflane_jax.plots.bev import draw_evidence, prepare
 from tflane_jax.plots.figure import columns_for, save_figure
@@ -58,3 +59,11 @@ def test_curves_of_a_notebook_have_the_colours_of_the_library():
 @pytest.mark.parametrize(("panels", "columns"), [(1, 1), (2, 2), (3, 3), (4, 2), (5, 3), (6, 3), (11, 3)])
 def test_no_panel_stands_alone_where_two_rows_can_be_filled(panels, columns):
     assert columns_for(panels) == columns
+
+
+def test_a_picture_that_is_too_large_is_told(tmp_path):
+    """`tflane data show --count 500` ended in matplotlib's traceback."""
+    figure, _ = new_figure(300, 1, panel=(2.0, 3.0))
+    with pytest.raises(UserError, match=r"pixels is too large; ask for fewer panels"):
+        save_figure(figure, tmp_path / "a.png")
+    assert list(tmp_path.iterdir()) == []

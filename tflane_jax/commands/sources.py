@@ -63,7 +63,7 @@ def opened(options: argparse.Namespace) -> tuple[Run, list[Path]]:
 
 def model_title(run: Run) -> str:
     """Return name and step of a model for pictures: the folder's name, or class and parts of a model in a store."""
-    name = Path(run.name).name
+    name = Path(run.name).resolve().name if run.name in (".", "..") else Path(run.name).name
     if is_key(name):
         model: Any = run.config.task.model
         parts = model.priors.configured if isinstance(model, HostConfig) else [_class_name(model.encoder)]

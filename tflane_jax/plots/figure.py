@@ -21,6 +21,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
+# On a side of a picture: matplotlib's limit.
+_MOST_PIXELS = 2**16
+
+
 def new_figure(
     rows: int = 1, columns: int = 1, *, panel: tuple[float, float] = (4.0, 3.0), footer: float = 0.0
 ) -> tuple[Figure, np.ndarray]:
@@ -97,12 +101,17 @@ def columns_for(panels: int) -> int:
 def save_figure(figure: Figure, path: Path, *, dpi: int = 110) -> Path:
     """Write the figure whole or not at all, in the format of the file's suffix, and return the path.
 
-    Raises UserError where the file cannot be written, or matplotlib does not know the format.
+    Raises UserError where the file cannot be written, matplotlib does not know the format, or the picture is too large.
     """
     path = Path(path)
     kind, known = path.suffix.removeprefix(".").lower() or "png", figure.canvas.get_supported_filetypes()
     if kind not in known:
         raise UserError(f"cannot write {path}: no picture ends in .{kind}; choose .png, .pdf, .svg or .jpg")
+    width, height = figure.get_size_inches() * dpi
+    if max(width, height) >= _MOST_PIXELS:
+        raise UserError(
+            f"cannot write {path}: a picture of {width:.0f} x {height:.0f} pixels is too large; ask for fewer panels"
+        )
     with replacing(path) as temporary:
         figure.savefig(temporary, dpi=dpi, format=kind)
     return path

@@ -184,8 +184,8 @@ def check_start(folder: Path, start: Start) -> None:
         )
     if start == "new" and (left := sorted(filter(_STEP.fullmatch, _names(folder / "checkpoints")))):
         raise UserError(
-            f"{folder} holds checkpoints ({left[-1]}), but not the config.json of their run: replace them with "
-            "--overwrite, delete the folder, or choose another one with --out"
+            f"{folder} holds checkpoints ({left[-1]}), but not the config.json of their run: delete the "
+            "folder, choose another one with --out, or let `tflane train` replace them with --overwrite"
         )
     if start == "resume" and not holds_run:
         raise UserError(f"{folder} holds no run to resume: leave --resume out to start one")

@@ -34,7 +34,6 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> int:
     """Write the splits, check the written files, and print their counts."""
     before = load_config(options.config)
     config = apply_overrides(before, overrides)
-
     splits: dict[Split, None] = dict.fromkeys(options.splits)
 
     def choose(given: RunConfig) -> dict[Split, Any]:

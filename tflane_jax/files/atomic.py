@@ -164,20 +164,19 @@ def _check_place(path: Path, probe: Path, above: Sequence[Path]) -> None:
         raise UserError(f"cannot write {path}: no right to write in {found}; choose another path")
 
 
-def check_replaces(outputs: Mapping[Path, Path], inputs: Iterable[Path], option: str = "--out") -> None:
+def check_replaces(outputs: Mapping[Path, Path], inputs: Iterable[Path]) -> None:
     """Raise UserError if a file to write would replace one to read.
 
     Args:
         outputs: for each file to write, the file that it is made from.
         inputs: all files to read.
-        option: that names the folder to write to.
     """
     read = {path.resolve() for path in inputs}
     for path, source in outputs.items():
         if path.resolve() in read:
             raise UserError(
                 f"{path} is one of the files to read, and what is made from {source} would replace it: choose another "
-                f"folder as {option}"
+                "folder with --out"
             )
 
 

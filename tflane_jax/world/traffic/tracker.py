@@ -19,6 +19,8 @@ from tflane_jax.world.bev.line_of_sight import hidden_points
 
 # Points of a box tested for line of sight, in half lengths and half widths: middle and near the corners.
 _PROBES = 0.9 * np.array([[0.0, 0.0], [1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]])
+# Of a tracked size, as a fraction of the true one.
+_LEAST_SIZE = 0.1
 
 
 @dataclass(frozen=True)
@@ -112,10 +114,6 @@ def track(
     identity = _switch(rng, identity, actors, config, rate_hz)
     size_noise = np.maximum(1.0 + rng.normal(size=(identity.max(initial=-1) + 1, 3)) * config.size_noise, _LEAST_SIZE)
     return _table(identity, seen, yaw, coasting, actors, size_noise)
-
-
-# Of a tracked size, as a fraction of the true one.
-_LEAST_SIZE = 0.1
 
 
 def visible_share(

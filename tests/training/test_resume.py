@@ -66,6 +66,46 @@ def test_a_run_that_lacks_a_new_setting_resumes_with_its_default(tmp_path, capsy
         run(folder, start="resume", current_form=completed, resolved=other)
 
 
+def test_an_edited_configuration_is_not_resumed(tmp_path):
+    """Only config.json was compared, with itself: a run went on with another schedule without a word."""
+    folder, edited = tmp_path / "run", RESOLVED | {"training": RESOLVED["training"] | {"steps": 99}}
+    run(folder, config=dataclasses.replace(CONFIG, steps=10))
+    (folder / "config.json").write_text(json.dumps(edited))
+    with pytest.raises(UserError, match=r"config.json was changed \(training.steps: .* since step 10: restore it from"):
+        run(folder, start="resume", resolved=edited)
+    (folder / "config.json").write_text(json.dumps(RESOLVED))
+    assert run(folder, start="resume").step == 30
+
+
+def test_a_checkpoint_without_a_configuration_is_damaged(tmp_path):
+    folder = tmp_path / "run"
+    run(folder, config=dataclasses.replace(CONFIG, steps=10))
+    path = max((folder / "checkpoints").glob("*/manifest.json"))
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"config": {}}))
+
+    def current(saved):
+        if not saved:
+            raise UserError("setting at the top should be a RunConfig, not {}")
+        return saved, []
+
+    with pytest.raises(UserError, match=r"step_00000010 is damaged: setting at the top .*; delete that folder"):
+        run(folder, start="resume", current_form=current)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    ['"step": -5, "split": "val"', '"step": 1, "split": "val", "a": 1' + "0" * 400],
+)
+def test_records_that_no_curve_can_show_are_named(tmp_path, wrong):
+    """They ended in tracebacks when the curves were drawn, after the last step."""
+    folder = tmp_path / "run"
+    run(folder, config=dataclasses.replace(CONFIG, steps=10))
+    path = folder / "metrics.jsonl"
+    path.write_text("{" + wrong + "}\n" + path.read_text())
+    with pytest.raises(UserError, match=r"metrics.jsonl, line 1 is no record: correct or delete that line"):
+        run(folder, start="resume")
+
+
 def test_a_resumed_run_may_have_other_workers(tmp_path):
     folder, workers = tmp_path / "run", {"threads": None, "ahead": None, "processes": 0}
     settings = RESOLVED | {"data": {"loading": {"where": "disk"} | workers}}

@@ -72,8 +72,8 @@ def _trained(options: argparse.Namespace, overrides: Sequence[str]) -> int:
     if result.metrics:
         several = f", mean of {len(config.training.seeds)} seeds" if len(config.training.seeds) > 1 else ""
         print("\n" + score_table(result.metrics, f"last evaluation, validation split{several}") + "\n")
-    if (out / "curves.png").exists():
-        print(f"pictures: {out / 'curves.png'}, {out / 'pictures'}")
+    if pictures := [str(path) for path in (out / "curves.png", out / "pictures") if path.exists()]:
+        print(f"pictures: {', '.join(pictures)}")
     print(f"evaluate with: tflane eval {shlex.quote(str(out))}{own}")
     return 0
 

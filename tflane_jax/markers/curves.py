@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import invert_pose, yaw_pose
-from tflane_jax.limits import NOT_EMPTY, Count, Fraction, Positive, above, check_settings
+from tflane_jax.limits import NOT_EMPTY, Count, Fraction, Positive, above_at_most, check_settings
 from tflane_jax.markers.image_search import DetectorConfig, find_markers
 from tflane_jax.markers.square_pose import marker_outline, solve_square
 from tflane_jax.scene import LineType
@@ -28,6 +28,7 @@ from tflane_jax.world.render.camera import PinholeCamera
 # Margin around a board in the rendered window, pixels, in addition to half the size of the board.
 _AROUND = 24
 _LANE, _HEIGHT = 3.5, 3.0
+_Distance = Annotated[float, above_at_most(1, 500)]  # the street is drawn up to it
 
 
 @dataclass(frozen=True)
@@ -44,7 +45,7 @@ class CurveConfig:
         detector: settings.
     """
 
-    distances: Annotated[tuple[Annotated[float, above(1)], ...], NOT_EMPTY] = tuple(map(float, range(5, 65, 5)))
+    distances: Annotated[tuple[_Distance, ...], NOT_EMPTY] = tuple(map(float, range(5, 65, 5)))
     turns: Annotated[tuple[float, ...], NOT_EMPTY] = (0.0, 20.0, 40.0)
     seeds: Count = 8
     mounts: Annotated[tuple[CameraMount, ...], NOT_EMPTY] = (ARGOVERSE2_RING[0], ARGOVERSE2_RING[2])

@@ -49,7 +49,11 @@ def _is_record(record: Any) -> bool:
         return False
     values = [value for name, value in record.items() if name not in ("step", "split")]
     numbers = [number for value in values for number in (value if isinstance(value, list) else [value])]
-    return all(type(number) in (int, float) for number in numbers)
+    return record["step"] >= 0 and all(_is_number(number) for number in numbers)
+
+
+def _is_number(value: Any) -> bool:
+    return type(value) is float or (type(value) is int and abs(value) < 2**63)
 
 
 class RecordWriter:

@@ -26,6 +26,7 @@ from tflane_jax.files.locks import take
 from tflane_jax.migrations import value_at
 from tflane_jax.processes import agreed, from_first
 from tflane_jax.startup import write
+from tflane_jax.training.checkpoint import Checkpoints
 
 Start = Literal["new", "resume", "overwrite"]
 CurrentForm = Callable[[dict[str, Any]], tuple[dict[str, Any], list[str]]]
@@ -80,14 +81,34 @@ def fixed(config: dict[str, Any]) -> dict[str, Any]:
 
 
 def check_unchanged(folder: Path, resolved: dict[str, Any], current_form: CurrentForm | None = None) -> list[str]:
-    """Return the notices of `current_form`; raise UserError if a run was started with another configuration (JSON)."""
+    """Return the notices of `current_form` for a run that is to be resumed with a configuration (JSON).
+
+    Raises UserError if config.json or the latest checkpoint has another one: the file may have been edited since.
+    """
+
+    def difference(saved: dict[str, Any]) -> str:
+        return first_difference(fixed(with_same_origin(saved, resolved, folder)), fixed(resolved))
+
     saved, notices = read_config(folder), []
     if current_form is not None:
         saved, notices = current_form(saved)
-    if difference := first_difference(fixed(with_same_origin(saved, resolved, folder)), fixed(resolved)):
+    if found := difference(saved):
         raise UserError(
-            f"{folder} was started with another configuration ({difference}): resume it as it is, or start another run"
+            f"{folder} was started with another configuration ({found}): resume it as it is, or start another run"
         )
+    checkpoints = Checkpoints(folder / "checkpoints")
+    for step in checkpoints.steps()[-1:]:
+        trained = checkpoints.manifest(step).config
+        try:
+            trained = trained if current_form is None else current_form(trained)[0]
+        except UserError as error:
+            raise UserError(f"{checkpoints.path(step)} is damaged: {error}; delete that folder") from error
+        if found := difference(trained):
+            raise UserError(
+                f"{folder / 'config.json'} was changed ({found}) since step {step}: restore it from the entry "
+                f'"config" of {checkpoints.path(step)}/manifest.json, or start another run from this one '
+                "(training.init_from)"
+            )
     return notices
 
 

@@ -16,7 +16,7 @@ from tflane_jax.errors import UserError
 from tflane_jax.training import loop
 from tflane_jax.training.checkpoint import Checkpoints
 from tflane_jax.training.provenance import provenance, read_provenance, thread_setting
-from tflane_jax.training.run_folder import check_start, claimed
+from tflane_jax.training.run_folder import check_start, claimed, read_config
 
 
 def exploding_after(step: int) -> dict:
@@ -104,6 +104,35 @@ def test_records_that_no_curve_can_show_are_named(tmp_path, wrong):
     path.write_text("{" + wrong + "}\n" + path.read_text())
     with pytest.raises(UserError, match=r"metrics.jsonl, line 1 is no record: correct or delete that line"):
         run(folder, start="resume")
+
+
+def test_records_of_other_numbers_of_seeds_are_named(tmp_path):
+    folder = tmp_path / "run"
+    run(folder, config=dataclasses.replace(CONFIG, steps=10))
+    path = folder / "metrics.jsonl"
+    path.write_text('{"step": 0, "split": "train", "loss": [1, 2]}\n' + path.read_text())
+    with pytest.raises(UserError, match=r"line 2 has another number of values of loss than a line before it: correct"):
+        run(folder, start="resume")
+
+
+def test_a_run_that_lost_its_configuration_says_where_a_copy_is(tmp_path):
+    folder = tmp_path / "run"
+    run(folder, config=dataclasses.replace(CONFIG, steps=10))
+    (folder / "config.json").unlink()
+    with pytest.raises(UserError, match=r"holds no run \(it has no config.json\). A copy is the entry \"config\" of"):
+        read_config(folder)
+
+
+def test_no_damaged_checkpoint_is_advised(tmp_path):
+    folder = tmp_path / "run"
+    run(folder, config=dataclasses.replace(CONFIG, steps=10, checkpoint_every=5))
+    checkpoints = Checkpoints(folder / "checkpoints")
+    assert len(checkpoints.steps()) == 2
+    for step in checkpoints.steps():
+        (checkpoints.path(step) / "manifest.json").unlink()
+    for step in checkpoints.steps():
+        with pytest.raises(UserError, match="there is no other: start the run again"):
+            checkpoints.manifest(step)
 
 
 def test_a_resumed_run_may_have_other_workers(tmp_path):

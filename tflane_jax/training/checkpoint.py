@@ -272,7 +272,7 @@ class Checkpoints:
         return UserError(f"cannot read checkpoint {self.path(step)}: {what}{reason}; {remedy}")
 
     def _damaged(self, step: int, why: str) -> UserError:
-        others = [other for other in self.steps() if other != step]
+        others = [other for other in self.steps() if other != step and (self.path(other) / "manifest.json").is_file()]
         remedy = f"the run can go on from step {others[-1]}" if others else "there is no other: start the run again"
         return _DamagedError(f"checkpoint {self.path(step)} is damaged ({why}): delete that folder; {remedy}")
 

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 
@@ -23,7 +23,8 @@ Record = dict[str, Any]
 def read_records(path: Path) -> list[Record]:
     """Return the records of a metrics.jsonl in order, without the last line if that is none (it may be cut short).
 
-    Raises UserError if the file cannot be read as text, or names an earlier line that is no record.
+    Raises UserError if the file cannot be read as text, or names an earlier line that is no record, or a line with
+    values of another number of seeds than an earlier one.
     """
     if not path.exists():
         return []
@@ -31,7 +32,8 @@ def read_records(path: Path) -> list[Record]:
         lines = read_text(path, "file of records").splitlines()
     except UserError as error:
         raise UserError(f"{error}: move it away, the run goes on without its earlier records") from error
-    records = []
+    records: list[Record] = []
+    counts: dict[tuple[str, str], int] = {}
     for number, line in enumerate(lines, start=1):
         try:
             record = json.loads(line)
@@ -39,12 +41,19 @@ def read_records(path: Path) -> list[Record]:
             record = None
         if _is_record(record):
             records.append(record)
+            for name, value in record.items():
+                count = len(value) if isinstance(value, list) else 1
+                if counts.setdefault((record["split"], name), count) != count:
+                    raise UserError(
+                        f"{path}, line {number} has another number of values of {name} than a line before it: correct "
+                        "or delete one of them; the others are kept"
+                    )
         elif number < len(lines):
             raise UserError(f"{path}, line {number} is no record: correct or delete that line; the others are kept")
     return records
 
 
-def _is_record(record: Any) -> bool:
+def _is_record(record: Any) -> TypeGuard[Record]:
     if not isinstance(record, dict) or type(record.get("step")) is not int or not isinstance(record.get("split"), str):
         return False
     values = [value for name, value in record.items() if name not in ("step", "split")]

@@ -54,7 +54,8 @@ def read_config(folder: Path) -> dict[str, Any]:
     """Return the resolved configuration of a run as saved (JSON); raises UserError if the folder holds no run."""
     path = folder / "config.json"
     if not path.exists():
-        raise UserError(f"{folder} holds no run (it has no config.json)")
+        copied = any(map(_STEP.fullmatch, _names(folder / "checkpoints")))
+        raise UserError(f"{folder} holds no run (it has no config.json)" + (f". {_COPY}" if copied else ""))
     try:
         content = load_json(path)
     except UserError as error:

@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 
@@ -187,6 +188,15 @@ def test_several_seeds_are_evaluated_with_mean_and_deviation(config, tmp_path):
     assert [row["seed"] for row in rows] == [0, 1, "mean", "std"]
     values = [row["DET_l"] for row in rows]
     np.testing.assert_allclose(values[2:], [np.mean(values[:2]), np.std(values[:2], ddof=1)])
+
+
+def test_where_scores_go_is_checked_before_the_evaluation(trained, tmp_path, monkeypatch, capsys):
+    """Also where --out is left out: the table was printed, minutes later, and could not be saved."""
+    run = shutil.copytree(trained, tmp_path / "run", ignore=shutil.ignore_patterns("evaluations"))
+    (run / "evaluations").touch()
+    monkeypatch.setattr("tflane_jax.commands.evaluate.evaluate_run", None)
+    assert main(["eval", str(run)]) == 2
+    assert f"{run / 'evaluations'} is no folder; choose another path" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

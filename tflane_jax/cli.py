@@ -10,7 +10,9 @@ import argparse
 import contextlib
 import errno
 import importlib
+import itertools
 import os
+import re
 import signal
 import sys
 import threading
@@ -53,6 +55,7 @@ def _open_closed() -> None:
 
 def _run(arguments: Sequence[str]) -> int:
     """Read the arguments, run the command and return its exit code."""
+    _check_filled(arguments)
     modules, others = take_imports(arguments)
     add_imports(modules)
     look_in(None)
@@ -68,6 +71,14 @@ def _run(arguments: Sequence[str]) -> int:
     code = (command(options, rest) if options.takes_overrides else command(options)) or 0
     sys.stdout.flush()  # here, where its errors are told
     return code
+
+
+def _check_filled(arguments: Sequence[str]) -> None:
+    """Raise UserError for an empty argument: as a path, it would be the working directory."""
+    for before, argument in itertools.pairwise(("tflane", *arguments)):
+        if not argument or re.fullmatch("--[^=]+=", argument):
+            place = f"{argument.removesuffix('=')} has an empty value" if argument else f"an empty word after {before}"
+            raise UserError(f"{place}: is a variable of the shell not set?")
 
 
 def _ended(arguments: Sequence[str]) -> int:

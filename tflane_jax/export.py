@@ -21,7 +21,6 @@ from jax import export
 from jaxtyping import Array, Float, UInt8
 
 from tflane_jax.errors import UserError
-from tflane_jax.files.atomic import write_bytes
 from tflane_jax.models.parameters import Params
 from tflane_jax.scene import LaneLines, RoadImage
 from tflane_jax.tasks.lane_shape import LaneShapeTask
@@ -47,17 +46,13 @@ def image_program(task: LaneShapeTask, params: Params) -> Callable[[UInt8[Array,
     return predict
 
 
-def export_model(
-    task: LaneShapeTask, params: Params, path: Path, *, height: int, width: int, platforms: Sequence[str] = PLATFORMS
-) -> Path:
-    """Write the model for images of one size and batches of any size; return the path.
-
-    Raises UserError where the file cannot be written.
-    """
+def serialized_model(
+    task: LaneShapeTask, params: Params, *, height: int, width: int, platforms: Sequence[str] = PLATFORMS
+) -> bytearray:
+    """Return the content of the file of a model, for images of one size and batches of any size."""
     (batch,) = export.symbolic_shape("b")
     images = jax.ShapeDtypeStruct((batch, height, width, 3), jnp.uint8)
-    content = export.export(jax.jit(image_program(task, params)), platforms=platforms)(images).serialize()
-    return write_bytes(path, content)
+    return export.export(jax.jit(image_program(task, params)), platforms=platforms)(images).serialize()
 
 
 def load_program(path: Path) -> export.Exported:

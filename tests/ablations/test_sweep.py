@@ -56,10 +56,11 @@ def test_every_run_is_evaluated_at_every_value(folder, tmp_path, monkeypatch, ca
 def test_a_flag_is_swept_by_true_and_false():
     """A flag takes no value on the command line, and a sweep needs values."""
     setting, cameras = "data.example.cameras.markers", ("--data.example.cameras", "default")
+    run = Run("run", CONFIG, CONFIG.training.steps, ())
     for value in (True, False):
-        tested: Any = _tested(CONFIG, *_given(setting, str(value)), *cameras)
+        tested: Any = _tested(run, *cameras, *_given(CONFIG, setting, str(value)))
         assert tested.data.example.cameras.markers is value
-    assert _given("data.world.severity", "0.5") == ("--data.world.severity", "0.5")
+    assert _given(CONFIG, "data.world.severity", "0.5") == ("--data.world.severity", "0.5")
 
 
 def test_runs_that_are_not_finished_are_named(capsys):

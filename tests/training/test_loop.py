@@ -19,7 +19,6 @@ from tests.training.stub_run import CONFIG, OPTIM, RESOLVED, run, score
 from tflane_jax.datasets.batches import batch_indices
 from tflane_jax.datasets.streaming import Streamed, StreamingConfig
 from tflane_jax.errors import UserError
-from tflane_jax.training import run_folder
 from tflane_jax.training.checkpoint import Checkpoints
 from tflane_jax.training.loop import train
 from tflane_jax.training.records import read_records
@@ -244,52 +243,14 @@ def test_drawing_sees_every_evaluation(tmp_path):
     assert seen[-1][2] == len(read_records(tmp_path / "run" / "metrics.jsonl"))
 
 
-def test_unsuitable_folders_are_refused(whole, tmp_path):
-    with pytest.raises(UserError, match=r"already holds a run.*--resume.*--overwrite"):
-        run(whole)
-    with pytest.raises(UserError, match="holds no run to resume"):
-        run(tmp_path / "nothing", start="resume")
-    with pytest.raises(UserError, match=r"another configuration \(training\.best_metric: score there, other here\)"):
-        run(whole, start="resume", resolved=RESOLVED | {"training": RESOLVED["training"] | {"best_metric": "other"}})
-    (tmp_path / "photos").mkdir()
-    (tmp_path / "photos" / "cat.jpg").touch()
-    for start in ("new", "overwrite"):
-        with pytest.raises(UserError, match=r"cat\.jpg"):
-            run(tmp_path / "photos", start=start)
-    assert (tmp_path / "photos" / "cat.jpg").exists()
-    (tmp_path / "file").touch()
-    with pytest.raises(UserError, match=r"cannot write .*is no folder"):
-        run(tmp_path / "file" / "run")
+def test_a_picture_that_cannot_be_written_is_told_and_the_training_goes_on(tmp_path, capsys):
+    def draw(folder, step, params, records):
+        raise UserError(f"cannot write {folder}/curves.png: File too large")
 
-
-def test_overwriting_starts_again_and_spares_foreign_files(tmp_path):
-    folder = tmp_path / "run"
-    short = dataclasses.replace(CONFIG, steps=10)
-    run(folder)
-    (folder / "notes.txt").touch()
-    run(folder, start="overwrite", config=short)
-    assert Checkpoints(folder / "checkpoints").steps() == [7, 10]
-    assert timeless(folder)[-1]["step"] == 10
-    assert (folder / "notes.txt").exists()
-
-
-def test_what_cannot_be_overwritten_is_named_and_stays_a_run(tmp_path, monkeypatch):
-    folder, elsewhere, short = tmp_path / "run", tmp_path / "disk", dataclasses.replace(CONFIG, steps=4)
-    run(folder, config=short)
-
-    def refuse(path):
-        raise PermissionError(13, "Permission denied", str(path / "step_00000004"))
-
-    with monkeypatch.context() as patch:
-        patch.setattr(run_folder.shutil, "rmtree", refuse)
-        with pytest.raises(UserError, match=r"cannot delete .*step_00000004: Permission denied"):
-            run(folder, start="overwrite", config=short)
-    (folder / "checkpoints").rename(elsewhere)
-    (folder / "checkpoints").symlink_to(elsewhere)
-    with pytest.raises(UserError, match=r"checkpoints is a link, and what it points to is not deleted"):
-        run(folder, start="overwrite", config=short)
-    assert Checkpoints(elsewhere).steps() == [4]
-    assert (folder / "config.json").exists()
+    run(tmp_path / "run", draw=draw)
+    assert Checkpoints(tmp_path / "run" / "checkpoints").steps()[-1] == 30
+    told = [line for line in capsys.readouterr().err.splitlines() if "no pictures of step" in line]
+    assert [line.partition(": ")[0] for line in told] == [f"no pictures of step {step}" for step in (10, 20, 30)]
 
 
 def test_two_processes_never_share_a_folder(tmp_path):

@@ -16,7 +16,7 @@ from tflane_jax.errors import UserError
 from tflane_jax.training import loop
 from tflane_jax.training.checkpoint import Checkpoints
 from tflane_jax.training.provenance import provenance, read_provenance, thread_setting
-from tflane_jax.training.run_folder import check_start, claimed, read_config
+from tflane_jax.training.run_folder import claimed, read_config
 
 
 def exploding_after(step: int) -> dict:
@@ -180,27 +180,6 @@ def test_a_run_of_an_earlier_version_knows_no_files(tmp_path):
     del manifest["progress"]["content"]
     path.write_text(json.dumps(manifest))
     assert run(folder, start="resume", content="scenes a, b").step == 30
-
-
-def test_checkpoints_without_a_run_are_no_place_for_a_new_one(tmp_path):
-    """Regression: those of the higher steps were kept, and the new run's were deleted."""
-    folder = tmp_path / "run"
-    run(folder)
-    (folder / "config.json").unlink()
-    with pytest.raises(UserError, match=r"holds checkpoints \(step_00000030\), but not the config.json"):
-        run(folder, config=dataclasses.replace(CONFIG, steps=20))
-    assert Checkpoints(folder / "checkpoints").steps()[-1] == 30
-    run(folder, config=dataclasses.replace(CONFIG, steps=20), start="overwrite")
-    assert Checkpoints(folder / "checkpoints").steps()[-1] == 20
-
-
-@pytest.mark.parametrize("kind", ["file", "link to itself"])
-def test_a_run_whose_checkpoints_are_no_folder_is_not_begun_anew(tmp_path, kind):
-    (tmp_path / "config.json").touch()
-    place = tmp_path / "checkpoints"
-    place.touch() if kind == "file" else place.symlink_to(place)
-    with pytest.raises(UserError, match="checkpoints is no folder: restore it"):
-        check_start(tmp_path, "resume")
 
 
 def test_a_file_system_without_locks_is_told_and_trained_on(tmp_path, capsys, monkeypatch):

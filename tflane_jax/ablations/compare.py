@@ -110,8 +110,11 @@ def compare(
 def _check_tests(configs: Mapping[str, RunConfig], tests: Tests) -> None:
     if OWN_TEST in tests:
         raise UserError("a test set needs a name")
+    own = next(iter(configs.values())).data.source("test")
     for name, settings in ({OWN_TEST: ()} | dict(tests)).items():
         sources = [with_test_set(config, settings).data.source("test") for config in configs.values()]
+        if settings and sources[0] == own:
+            raise UserError(f"test set {name} is the configurations' own test split: {' '.join(settings)} changes none")
         if any(source != sources[0] for source in sources):
             what = f"test set {name}" if name else "data.test"
             raise UserError(f"the configurations have different test data ({what}): their numbers cannot be compared")

@@ -13,8 +13,10 @@ from tflane_jax.ablations.comparison import compact
 from tflane_jax.ablations.scores import with_settings
 from tflane_jax.config import RunConfig
 from tflane_jax.config_help import meaning
+from tflane_jax.config_io import first_difference, to_json
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import check_folder
+from tflane_jax.migrations import value_at
 from tflane_jax.plots.tables import counted, format_table, save_table
 from tflane_jax.progress import progress_bar
 from tflane_jax.runs import Run, load_test_data, open_run
@@ -52,12 +54,16 @@ def sweep(
     if not setting.startswith("data."):
         raise UserError(f"--setting {setting}: give a setting of the data (data...), the models are trained already")
     check_folder(out)
+    _check_not_given(setting, overrides)
     runs = {name: runs_below(folder, which) for name, folder in models.items()}
     unfinished = _tell_unfinished([run for each in runs.values() for run in each]) if which == "last" else 0
     tested = {
-        value: {name: [_tested(run.config, *_given(setting, value), *overrides) for run in runs[name]] for name in runs}
+        value: {
+            name: [_tested(run, *overrides, *_given(run.config, setting, value)) for run in runs[name]] for name in runs
+        }
         for value in values
     }
+    _check_values(setting, {value: next(iter(by_name.values()))[0] for value, by_name in tested.items()})
     for value, by_name in tested.items():
         _check_same_data(f"{setting} = {value}", by_name)
         for config in (config for each in by_name.values() for config in each):
@@ -109,16 +115,44 @@ def _tell_unfinished(runs: Sequence[Run]) -> int:
     return len(found)
 
 
-def _given(setting: str, value: str) -> tuple[str, ...]:
+def _given(config: RunConfig, setting: str, value: str) -> tuple[str, ...]:
     """Return the arguments that give a setting its value; flags take none."""
     part, dot, last = setting.rpartition(".")
-    return {"True": (f"--{setting}",), "False": (f"--{part}{dot}no-{last}",)}.get(value, (f"--{setting}", value))
+    flag = {"True": (f"--{setting}",), "False": (f"--{part}{dot}no-{last}",)}.get(value)
+    is_flag = isinstance(value_at(to_json(config), setting.replace("-", "_"), default=True), bool)
+    return flag if flag is not None and is_flag else (f"--{setting}", value)
 
 
-def _tested(config: RunConfig, *arguments: str) -> RunConfig:
+def _check_not_given(setting: str, overrides: Sequence[str]) -> None:
+    """Raise UserError for an override of the swept setting, or of a part of it."""
+    swept = setting.replace("-", "_")
+    for text in overrides:
+        part, dot, last = text.partition("=")[0].removeprefix("--").replace("-", "_").rpartition(".")
+        name = f"{part}{dot}{last.removeprefix('no_')}"
+        if text.startswith("--") and f"{name}.".startswith(f"{swept}."):
+            raise UserError(f"{text.partition('=')[0]} is what --setting {setting} sweeps: leave it out")
+
+
+def _check_values(setting: str, tested: Mapping[str, RunConfig]) -> None:
+    """Raise UserError for two values with which a run is evaluated on the same data in the same way."""
+    seen: list[tuple[str, RunConfig]] = []
+    for value, config in tested.items():
+        for other, before in seen:
+            if before.data.source("test") == config.data.source("test") and before.evaluation == config.evaluation:
+                raise UserError(
+                    f"{setting} = {other} and {value} are the same test: give values that change the test split"
+                )
+        seen.append((value, config))
+
+
+def _tested(run: Run, *arguments: str) -> RunConfig:
     """Return a run's configuration with other settings of data and evaluation; raises UserError for others."""
-    common = replace(config, training=replace(config.training, seeds=(0,), init_from=None))
-    changed = with_settings(common, arguments)
+    config = run.config
+    common = _without_seed(config)
+    try:
+        changed = with_settings(common, arguments)
+    except UserError as error:
+        raise UserError(f"{run.name}: {error}") from None
     if replace(changed, data=common.data, evaluation=common.evaluation) != common:
         given = ", ".join(argument for argument in arguments if argument.startswith("--"))
         raise UserError(
@@ -146,8 +180,30 @@ def _check_metrics(metrics: Collection[str], known: Collection[str]) -> None:
 
 
 def runs_below(folder: Path, which: Literal["last", "best"] = "last") -> list[Run]:
-    """Return the run of a folder, or the runs of its subfolders; raises UserError if there is none."""
-    folders = [folder] if (folder / "config.json").is_file() else sorted(p.parent for p in folder.glob("*/config.json"))
+    """Return the run of a folder, or those of its subfolders, one a seed.
+
+    Raises UserError if there is none, or if they differ in more than the seed.
+    """
+    folders = [folder] if _is_run(folder) else sorted(filter(_is_run, folder.glob("*")))
     if not folders:
         raise UserError(f"{folder} is no run folder, and holds none")
-    return [open_run(each, which) for each in folders]
+    runs = [open_run(each, which) for each in folders]
+    seeds = [seed for run in runs for seed in run.config.training.seeds]
+    first, *others = (_without_seed(run.config) for run in runs)
+    for run, config in zip(runs[1:], others, strict=True):
+        if difference := first_difference(to_json(first), to_json(config)):
+            raise UserError(
+                f"{runs[0].name} and {run.name} are no seeds of one configuration ({difference}): name each by itself"
+            )
+    if len(set(seeds)) < len(seeds):
+        raise UserError(f"two of the runs below {folder} have the same seed: name each by itself")
+    return runs
+
+
+def _is_run(folder: Path) -> bool:
+    return (folder / "config.json").is_file() or (folder / "checkpoints").is_dir()
+
+
+def _without_seed(config: RunConfig) -> RunConfig:
+    """Return the configuration with what differs between the seeds of a comparison as a constant."""
+    return replace(config, training=replace(config.training, seeds=(0,), init_from=None))

@@ -90,6 +90,8 @@ def _named(argument: str) -> tuple[str, str, list[str]]:
     if not separator:
         path, ablation = split_reference(row)
         name, reference = ablation or Path(path).stem, row
+    elif not name:
+        raise UserError(f"{argument}: the name before = is empty")
     return name, reference.strip(), _split(dashes + settings, argument)
 
 

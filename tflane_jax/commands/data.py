@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from tflane_jax.commands.outputs import check_output, check_table, folders_of
 from tflane_jax.commands.sources import check_used, chosen_source, data_name
 from tflane_jax.commands.views import with_images
 from tflane_jax.config import FrontViewData, RunConfig, load_config
@@ -18,7 +19,6 @@ from tflane_jax.datasets.base import SPLITS
 from tflane_jax.datasets.batches import prepared
 from tflane_jax.datasets.overlap import overlap, read_drives
 from tflane_jax.errors import UserError
-from tflane_jax.files.atomic import check_stem, check_writable
 from tflane_jax.plots import dataset_summary, format_table, save_camera_views, save_table, show_dataset
 from tflane_jax.plots.tables import counted, written_to
 from tflane_jax.scene import RoadImage, stack_examples
@@ -32,7 +32,7 @@ _FORMAT = "argoverse2"  # of `data check`, by default
 
 def show(options: argparse.Namespace, overrides: Sequence[str]) -> int:
     """Draw samples of a split, and print counts of their content."""
-    check_writable(options.out)
+    check_output(options.out)
     before = RunConfig() if options.config is None else load_config(options.config)
     config = apply_overrides(before, overrides)
     images = options.data is not None and sources.named_source(options.data).example is RoadImage
@@ -42,6 +42,7 @@ def show(options: argparse.Namespace, overrides: Sequence[str]) -> int:
 
     source = choose(config)
     check_used(overrides, before, config, choose, options.data)
+    check_output(options.out, folders_of(source))
     if sources.source_of(source).example is RoadImage:
         return _show_images(source, config, options)
     dataset = sources.make_dataset(source)
@@ -132,7 +133,7 @@ def _print_list(title: str, texts: Sequence[str], *, every: bool) -> None:
 def overlap_of_splits(options: argparse.Namespace) -> int:
     """Print the fraction of a validation split that lies near training frames."""
     if options.out is not None:
-        check_stem(options.out)
+        check_table(options.out, [options.train, options.validation])
     train, validation = read_drives(options.train), read_drives(options.validation)
     found = overlap(train, validation)
     title = (

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from tflane_jax.commands.outputs import check_table, folders_of
 from tflane_jax.commands.sources import chosen_source
 from tflane_jax.config import RunConfig
 from tflane_jax.datasets import argoverse2, recorded_logs, sources
@@ -18,7 +19,6 @@ from tflane_jax.datasets.recorded_logs import RECORDED_EXAMPLE
 from tflane_jax.errors import UserError
 from tflane_jax.evaluation.example_statistics import example_stats
 from tflane_jax.evaluation.scene_statistics import frame_quantities, lane_quantities, pooled
-from tflane_jax.files.atomic import check_stem
 from tflane_jax.plots import format_table, save_table
 from tflane_jax.plots.distributions import save_distributions
 from tflane_jax.plots.tables import written_to
@@ -38,7 +38,7 @@ def beside(config: RunConfig, options: argparse.Namespace) -> int:
     All have the box, the history and at least the capacities of the chosen data, so that they can be compared.
     """
     if options.out is not None:
-        check_stem(options.out)
+        check_table(options.out)
     others = [text.partition("=")[0] for text in options.beside]
     is_for_others = options.data != _READS_OPENLANE and _READS_OPENLANE in others
     first = chosen_source(config, _with(options, openlane=None) if is_for_others else options)
@@ -55,6 +55,8 @@ def beside(config: RunConfig, options: argparse.Namespace) -> int:
         )
         _check(source)
         chosen[_unused(name, chosen)] = replace(source, example=_same(first.example, source))
+    if options.out is not None:
+        check_table(options.out, folders_of(*chosen.values()))
     values, counts = {}, {}
     for name, source in chosen.items():
         values[name] = _values(source, options.count)

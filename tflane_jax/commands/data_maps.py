@@ -5,12 +5,12 @@ from __future__ import annotations
 import argparse
 from dataclasses import dataclass, replace
 
+from tflane_jax.commands.outputs import check_output
 from tflane_jax.datasets.base import Dataset, FrameInfo
 from tflane_jax.datasets.real_maps import RealMapConfig, RealMapDataset
 from tflane_jax.datasets.recorded_logs import RecordedConfig, RecordedDataset
 from tflane_jax.datasets.road_maps import chosen_maps
 from tflane_jax.errors import UserError
-from tflane_jax.files.atomic import check_writable
 from tflane_jax.plots import show_dataset
 from tflane_jax.scene import Example
 from tflane_jax.world.presets import REAL_MAPS
@@ -37,7 +37,7 @@ class _Chosen:
 
 def run(options: argparse.Namespace) -> int:
     """Draw the frames of recorded logs and of the world on their maps, a row for each log."""
-    check_writable(options.out)
+    check_output(options.out, [options.root])
     if options.scene < 0:
         raise UserError(f"--scene is the number of a scene, 0 or more, not {options.scene}")
     logs = [one.name for one in chosen_maps(options.root, options.logs) if one.recorded]

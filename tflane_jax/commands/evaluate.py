@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from tflane_jax.commands.outputs import check_table
 from tflane_jax.commands.sources import (
     data_name,
     limited_task,
@@ -24,7 +25,6 @@ from tflane_jax.errors import UserError
 from tflane_jax.evaluation.edge_types import weights_edge_types
 from tflane_jax.evaluation.interventions import with_traffic
 from tflane_jax.evaluation.lane_errors import lane_errors
-from tflane_jax.files.atomic import check_stem
 from tflane_jax.plots.tables import format_table, save_table, written_to
 from tflane_jax.runs import Run, evaluate_run
 from tflane_jax.scene import stack_examples
@@ -42,7 +42,7 @@ _IMAGES = 8  # over which a HAN's weights are averaged
 def run(options: argparse.Namespace) -> int:
     """Evaluate, print the table, and write it as Markdown and JSON."""
     if options.out is not None:
-        check_stem(options.out)  # before the evaluation, which takes minutes
+        check_table(options.out)  # before the evaluation, which takes minutes
     configure_jax()
     trained, rest = opened(options)
     if rest:
@@ -64,7 +64,7 @@ def run(options: argparse.Namespace) -> int:
     # Published weights have no run folder: theirs are distinguished by name.
     of_weights = Path("runs") / "evaluations" / f"{Path(trained.name).stem}-{name}"
     stem = options.out or (of_weights if options.config else Path(trained.name) / "evaluations" / name)
-    check_stem(stem)
+    check_table(stem)
     protocol, rows = evaluate_run(trained, source, task=task, frame_groups=groups)
     title = f"{trained.name}, {name}: {protocol}"
     print(format_table(rows, title=title))

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from tflane_jax.commands.outputs import check_output
 from tflane_jax.datasets.argoverse2_log import load_log
 from tflane_jax.datasets.marker_observations import store_of_log
 from tflane_jax.errors import UserError
@@ -25,6 +26,7 @@ def run(options: argparse.Namespace) -> int:
     surveyed, expires = day_of(options.surveyed, "--surveyed"), day_of(options.expires, "--expires")
     if surveyed is not None and expires is not None and expires <= surveyed:
         raise UserError(f"--expires {expires} must be after --surveyed {surveyed}: before it, no entry would be valid")
+    check_output(options.out, [] if options.log.isdecimal() else [Path(options.log)])
     log = _open_log(options.log)
     store = store_of_log(
         log, radius=options.radius, bike_lanes=options.bike_lanes == "include", surveyed=surveyed, expires=expires

@@ -8,8 +8,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from tflane_jax.commands.outputs import check_table
 from tflane_jax.errors import UserError
-from tflane_jax.files.atomic import check_stem
 from tflane_jax.files.wording import check_name, named
 from tflane_jax.metrics.groups import shown_of_part
 from tflane_jax.plots.tables import format_table, save_table, written_to
@@ -20,6 +20,8 @@ from tflane_jax.scoring.score import Scored, check_bootstrap, score
 
 _COUNTED = ("lanes", "lines")
 """Numbers of true lanes, or of lines of a map, that the scores of a part rest on."""
+
+_MOST_DRAWS = 100_000
 
 
 def run(options: argparse.Namespace) -> int:
@@ -69,8 +71,8 @@ def run(options: argparse.Namespace) -> int:
 
 def _check(options: argparse.Namespace, protocol: ScoringProtocol) -> None:
     """Raise UserError for options that cannot be followed, before any file is read."""
-    if options.bootstrap < 0:
-        raise UserError(f"--bootstrap {options.bootstrap}: give a number of draws, 0 for none")
+    if not 0 <= options.bootstrap <= _MOST_DRAWS:
+        raise UserError(f"--bootstrap {options.bootstrap}: give a number of draws up to {_MOST_DRAWS:,}, 0 for none")
     if options.by not in (None, "scene", *protocol.groups):
         raise UserError(f"{options.protocol} cannot be reported by {options.by}")
     inputs = [path for path in (options.predictions, options.truth, options.scenes) if path is not None]
@@ -78,11 +80,7 @@ def _check(options: argparse.Namespace, protocol: ScoringProtocol) -> None:
         check_name(path)
     if _same(options.predictions, options.truth):
         raise UserError(f"{options.predictions} is given as PREDICTIONS and as GROUND_TRUTH: name the other file too")
-    check_stem(options.out)
-    for suffix in (".md", ".json"):
-        written = options.out.with_name(options.out.name + suffix)
-        if any(_same(written, path) for path in inputs):
-            raise UserError(f"--out {options.out} would write over {written}, which is read: choose another name")
+    check_table(options.out, inputs)
 
 
 def _same(one: Path, other: Path) -> bool:

@@ -10,6 +10,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from tflane_jax.commands.outputs import check_output, folders_of
 from tflane_jax.commands.sources import opened, source_for
 from tflane_jax.datasets.nuscenes import NuScenesConfig, NuScenesDataset
 from tflane_jax.datasets.openlane_v2 import OpenLaneV2Config, OpenLaneV2Dataset
@@ -18,7 +19,6 @@ from tflane_jax.evaluation.centerlines import detections_of_centerlines
 from tflane_jax.evaluation.lane_segments import detections_of_segments
 from tflane_jax.evaluation.predict import predicted_batches
 from tflane_jax.evaluation.vector_maps import detections_of_lines
-from tflane_jax.files.atomic import check_writable
 from tflane_jax.metrics.map_matching import MapDetections
 from tflane_jax.progress import progress_bar
 from tflane_jax.runs import Run
@@ -34,7 +34,7 @@ _OF_SERVER = ("method", "authors", "email", "institution", "country", "team")
 
 def run(options: argparse.Namespace) -> int:
     """Predict all frames of the split and write the submission."""
-    check_writable(options.out)
+    check_output(options.out)
     configure_jax()
     trained, rest = opened(options)
     if rest:
@@ -49,6 +49,7 @@ def run(options: argparse.Namespace) -> int:
     if isinstance(source, OpenLaneV2Config | NuScenesConfig) and options.split is not None:
         # Configurations evaluate on the validation split in place of the test, which has no truth.
         source = replace(source, split=options.split)
+    check_output(options.out, folders_of(source))
     if isinstance(source, OpenLaneV2Config):
         if not {"centerlines", "segments"} & predicts:
             raise UserError("this model predicts neither centerlines nor lane segments: OpenLane-V2 has no other task")

@@ -8,10 +8,10 @@ from typing import Any
 
 import jax
 
+from tflane_jax.commands.outputs import check_table
 from tflane_jax.config import RunConfig, load_config
 from tflane_jax.config_overrides import apply_overrides
 from tflane_jax.errors import UserError
-from tflane_jax.files.atomic import check_stem
 from tflane_jax.plan import UTILISATION, make_plan
 from tflane_jax.plots.tables import format_table, save_table, written_to
 from tflane_jax.run_checks import check_kind
@@ -23,7 +23,7 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> int:
     """Print the two tables, and save them to --out; or the estimate of --plan."""
     _check_together(options)
     if options.out is not None:
-        check_stem(options.out)
+        check_table(options.out)
     # XLA for GPUs counts no operations, and nothing here runs.
     jax.config.update("jax_platforms", "cpu")
     configure_jax(keep_programs=False)  # compiling is timed

@@ -14,6 +14,8 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> int:
     """Evaluate trained models for each value of a setting."""
     from tflane_jax.ablations.sweep import sweep
 
+    if empty := [reference for reference in options.runs if reference.startswith("=")]:
+        raise UserError(f"{empty[0]}: the name before = is empty")
     pairs = [reference.partition("=") for reference in options.runs]
     models = {name if path else Path(name).name: Path(path or name) for name, _, path in pairs}
     if len(models) < len(pairs):

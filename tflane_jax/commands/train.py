@@ -55,7 +55,7 @@ def _trained(options: argparse.Namespace, overrides: Sequence[str]) -> int:
         result = train_run(config, out, start=options.start)
     except KeyboardInterrupt as error:
         number = getattr(error, "number", signal.SIGINT)
-        began = options.start == "resume" or _saved_at(out) != before
+        began = options.start == "resume" or _saved_at(out) not in (None, before)
         remedy = f"; {resume}" if began else _NOT_BEGUN
         print(f"stopped by {signal.Signals(number).name}{remedy}", file=sys.stderr)
         processes.end_alone(128 + number)

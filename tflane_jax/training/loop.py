@@ -20,7 +20,6 @@ from tflane_jax.datasets.batches import Prepare, batches, first_example
 from tflane_jax.datasets.batches import count as example_count
 from tflane_jax.devices import divided, of_one_process, share, training_mesh
 from tflane_jax.errors import UserError
-from tflane_jax.files.atomic import write_json, write_text
 from tflane_jax.limits import DIFFERENT, NOT_EMPTY, Count, Rules, Seed, check_settings, splits
 from tflane_jax.models.parameters import Params
 from tflane_jax.processes import AgreedError, agreed, apart, arrays_from_first, count, from_first, is_first, stop_signal
@@ -30,11 +29,18 @@ from tflane_jax.training.adaptive import Memory
 from tflane_jax.training.checkpoint import Checkpoints, Manifest
 from tflane_jax.training.fine_tuning import origins, starting_params
 from tflane_jax.training.interrupt import StopRequest
-from tflane_jax.training.notices import NO_BEST, due_notices, not_finite, print_notices
-from tflane_jax.training.provenance import add_provenance
+from tflane_jax.training.notices import NO_BEST, due_notices, not_finite, only_told, print_notices
 from tflane_jax.training.records import Record, RecordWriter, Unwritten, Window, by_name, read_records, seed_record
 from tflane_jax.training.restarts import adapt
-from tflane_jax.training.run_folder import CurrentForm, Start, agree_on_data, check_same_data, check_unchanged, claimed
+from tflane_jax.training.run_folder import (
+    CurrentForm,
+    Start,
+    agree_on_data,
+    begin,
+    check_same_data,
+    check_unchanged,
+    claimed,
+)
 from tflane_jax.training.schedule import OptimConfig, make_optimizer, scaled_to_batch
 from tflane_jax.training.sharding import placed
 from tflane_jax.training.state import init_states, of_all_seeds, per_seed, state_of
@@ -217,13 +223,7 @@ def train(
         first = step = int(states[0].step)
 
         drawn = from_first(lambda: draw is not None)  # the first process draws, from what all gather
-
-        def begin() -> None:
-            print_notices(add_provenance(folder, **started_from))
-            write_text(folder / "config.txt", resolved_text)
-            write_json(folder / "config.json", resolved)  # last: from here on the folder holds a run
-
-        from_first(begin)
+        from_first(lambda: print_notices(begin(folder, start, resolved, resolved_text, **started_from)))
 
         # =============================================================================================================
         # Compile
@@ -286,7 +286,7 @@ def train(
                 if drawn:
                     shown = states[0].ema_params  # several processes gather them together
                     if draw is not None and is_first():
-                        with apart():
+                        with apart(), only_told(f"no pictures of step {step}"):
                             draw(folder, step, shown, writer.records)
 
             if due and evaluate is not None:

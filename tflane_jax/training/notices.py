@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import contextlib
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 
+from tflane_jax.errors import UserError
 from tflane_jax.startup import write
 from tflane_jax.training.records import Record
 
@@ -33,6 +35,15 @@ def due_notices(untold: dict[str, str], record: Record) -> list[str]:
     """Return the notices whose terms are above 0 in a record, and take them from `untold`."""
     due = [name for name in untold if np.max(record.get(name, 0.0)) > 0]
     return [f"step {record['step']}: {name} is {np.max(record[name]):.3g}. {untold.pop(name)}" for name in due]
+
+
+@contextlib.contextmanager
+def only_told(what: str) -> Iterator[None]:
+    """Write an error of the user's inside the block as a notice that begins with `what`, and go on."""
+    try:
+        yield
+    except UserError as error:
+        write(f"{what}: {error}")
 
 
 def print_notices(notices: Sequence[str]) -> None:

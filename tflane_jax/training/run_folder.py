@@ -20,13 +20,14 @@ from typing import Any, Literal
 
 from tflane_jax.config_io import first_difference
 from tflane_jax.errors import UserError
-from tflane_jax.files.atomic import check_writable, is_temporary
+from tflane_jax.files.atomic import check_writable, is_temporary, write_json, write_text
 from tflane_jax.files.fields import load_json
 from tflane_jax.files.locks import take
 from tflane_jax.migrations import value_at
 from tflane_jax.processes import agreed, from_first
 from tflane_jax.startup import write
 from tflane_jax.training.checkpoint import Checkpoints
+from tflane_jax.training.provenance import add_provenance
 
 Start = Literal["new", "resume", "overwrite"]
 CurrentForm = Callable[[dict[str, Any]], tuple[dict[str, Any], list[str]]]
@@ -35,19 +36,17 @@ _COPY = 'A copy is the entry "config" of checkpoints/step_.../manifest.json: wri
 _FREE = {"training": ("shard_state",), "evaluation": ("batch_size", "pictures")}
 _STEP = re.compile("step_0*[1-9][0-9]*")  # not step 0, which a conversion that was killed leaves
 _WORKERS = ("threads", "ahead", "processes")  # of `StreamingConfig`
-_CONTENT = (
+_FILES = (
     "config.json",
     "config.txt",
     "provenance.json",
     "metrics.jsonl",
     "metrics.jsonl.tmp",
-    "tensorboard",
-    "checkpoints",
     "curves.png",
-    "pictures",
-    "evaluations",
     "run.lock",
 )
+_FOLDERS = ("tensorboard", "checkpoints", "pictures", "evaluations")
+_CONTENT = (*_FILES, *_FOLDERS)
 
 
 def read_config(folder: Path) -> dict[str, Any]:
@@ -173,8 +172,7 @@ def claimed(folder: Path, start: Start) -> Iterator[None]:
 
     Args:
         folder: of the run.
-        start: "new" refuses a folder that holds a run, "overwrite" deletes that run (and no other files), "resume"
-            requires a run.
+        start: "new" refuses a folder that holds a run, "overwrite" replaces it (see `begin`), "resume" requires a run.
 
     Raises:
         UserError: the folder does not fit `start`, another process trains into it, or it cannot be written.
@@ -187,18 +185,37 @@ def claimed(folder: Path, start: Start) -> Iterator[None]:
         raise UserError(f"cannot write to {folder}: {error.strerror or error}") from error
     with lock:
         _lock(lock.fileno(), folder)
-        if start == "overwrite":
-            for name in reversed(_CONTENT):  # config.json last: until then the folder holds a run to overwrite
-                _delete(folder / name)
         yield
+
+
+def begin(folder: Path, start: Start, config: dict[str, Any], text: str, **started_from: Any) -> list[str]:
+    """Write the first files of a run into a claimed folder, and return notices about the code that trains it.
+
+    Only here "overwrite" deletes the run that was there: whatever fails before leaves it whole.
+
+    Args:
+        folder: of the run.
+        start: as for `claimed`.
+        config, text: resolved configuration, as JSON and as text.
+        started_from: see `provenance.add_provenance`.
+    """
+    if start == "overwrite":
+        for name in reversed(_CONTENT):  # config.json last: until then the folder holds a run to overwrite
+            _delete(folder / name)
+    notices = add_provenance(folder, **started_from)
+    write_text(folder / "config.txt", text)
+    write_json(folder / "config.json", config)  # last: from here on the folder holds a run
+    return notices
 
 
 def check_start(folder: Path, start: Start) -> None:
     """Raise UserError where `claimed` would, as far as can be told beforehand; nothing is written."""
     check_writable(folder / "run.lock")
-    holds_run = (folder / "config.json").exists()
+    holds_run = (folder / "config.json").is_file()
     if is_locked(folder):
         raise _in_use(folder)
+    if start != "overwrite":
+        _check_kinds(folder)
     if start == "new" and holds_run:
         raise UserError(
             f"{folder} already holds a run: continue it with --resume, replace it with --overwrite, "
@@ -211,9 +228,6 @@ def check_start(folder: Path, start: Start) -> None:
         )
     if start == "resume" and not holds_run:
         raise UserError(f"{folder} holds no run to resume: leave --resume out to start one")
-    checkpoints = folder / "checkpoints"
-    if start == "resume" and os.path.lexists(checkpoints) and not checkpoints.is_dir():
-        raise UserError(f"{checkpoints} is no folder: restore it, or start the run again with --overwrite")
     if start == "overwrite" and (links := [folder / name for name in _CONTENT if (folder / name).is_symlink()]):
         raise UserError(
             f"{links[0]} is a link, and what it points to is not deleted: remove the link, or choose another folder "
@@ -222,6 +236,24 @@ def check_start(folder: Path, start: Start) -> None:
     # A process killed while it wrote the first file leaves a temporary one: still no foreign file.
     if not holds_run and (other := {name for name in _names(folder) if not is_temporary(name)} - set(_CONTENT)):
         raise UserError(f"{folder} is not empty ({min(other)}) and holds no run: choose another folder with --out")
+
+
+def _check_kinds(folder: Path) -> None:
+    """Raise UserError for a folder in the place of a run's file, or the reverse."""
+    for name in _CONTENT:
+        path, is_folder = folder / name, name in _FOLDERS
+        if os.path.lexists(path) and not (path.is_dir() if is_folder else path.is_file()):
+            what = "no folder, as a run has" if is_folder else "no file, as a run has"
+            raise UserError(f"{path} is {what} under that name: restore it or move it away, or use --overwrite")
+
+
+def is_part_of_run(path: Path) -> bool:
+    """Return whether a file exists that is a run's own, and no table or picture made from the run."""
+    if not path.exists():
+        return False
+    path = path.resolve()
+    folder = next((folder for folder in path.parents if (folder / "checkpoints").is_dir()), None)
+    return folder is not None and path.relative_to(folder).parts[0] in set(_CONTENT) - {"pictures", "evaluations"}
 
 
 def _names(folder: Path) -> list[str]:

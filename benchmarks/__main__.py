@@ -7,6 +7,8 @@ images (`marker_*`), at the papers' sizes (`paper_sizes`) and on a GPU (`gpu.ste
 
 from __future__ import annotations
 
+import sys
+
 from benchmarks import (
     attention_masks,
     camera_world,
@@ -19,9 +21,19 @@ from benchmarks import (
     metrics,
 )
 from benchmarks.timing import command_line
+from tflane_jax.cli import exit_code
 
-parser = command_line(__doc__)
-options = parser.parse_args()
-for benchmark in (host, attention_masks, masking_variants, metrics, lstr, deformable, markers, camera_world, loading):
-    print(f"\n== {benchmark.__name__}\n", flush=True)
-    benchmark.run(options.out)
+ALL = (host, attention_masks, masking_variants, metrics, lstr, deformable, markers, camera_world, loading)
+
+
+def main() -> int:
+    """Run them all."""
+    options = command_line(__doc__).parse_args()
+    for benchmark in ALL:
+        print(f"\n== {benchmark.__name__}\n", flush=True)
+        benchmark.run(options.out)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(exit_code(main))

@@ -156,7 +156,11 @@ def test_errors_name_the_remedy(photos, tmp_path, capsys, change, words):
 
 
 @pytest.mark.parametrize(
-    "option", ["--scales -1", "--seeds 0", "--sigma-d 0", "--distances 0.5", "--distances 1e9", "--severity 2"]
+    "option",
+    [
+        *("--scales -1", "--scales 0.2000001 0.2000002", "--seeds 0", "--sigma-d 0", "--distances 0.5"),
+        *("--distances 1e9", "--severity 2", "--enlarge 1000"),
+    ],
 )
 def test_curves_refuse_invalid_settings_by_the_name_of_the_option(option, tmp_path, capsys):
     assert main(["markers", "curves", "--out", str(tmp_path / "out"), *option.split()]) == 2

@@ -2,14 +2,20 @@
 
 import contextlib
 import errno
+import multiprocessing
 import os
+import re
 import shlex
+import signal
 import subprocess
 import sys
+from concurrent.futures import ProcessPoolExecutor
 
 import jax
+import numpy as np
 import pytest
 
+from tflane_jax.child_processes import spared_interrupts
 from tflane_jax.cli import OneLineWarnings, main
 from tflane_jax.commands.train import score_table
 from tflane_jax.datasets.base import TruncationWarning
@@ -34,6 +40,27 @@ def test_a_folder_that_may_not_be_read_is_one_line(monkeypatch, capsys):
     assert main(["cache", "list"]) == 2
     said = capsys.readouterr().err
     assert said == "tflane: /private/runs: Permission denied: give yourself the right, or choose another path\n"
+
+
+def test_an_array_that_does_not_fit_is_one_line(monkeypatch, capsys):
+    monkeypatch.setattr("tflane_jax.commands.cache.show", lambda _: np.zeros(2**55))
+    assert main(["cache", "list"]) == 2
+    assert re.fullmatch("tflane: memory is full: Unable to allocate 256. PiB .*\n", capsys.readouterr().err)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signal masks")
+def test_processes_started_so_see_no_interrupt_and_this_one_does():
+    """Ctrl-C reaches the whole process group, also children that still import their modules."""
+    wait = [sys.executable, "-c", "import os; os.kill(os.getpid(), 2); print('goes on')"]
+    with spared_interrupts():
+        spared = subprocess.run(wait, capture_output=True, text=True, check=False)
+        with ProcessPoolExecutor(2, multiprocessing.get_context("spawn")) as pool:
+            masks = [pool.submit(signal.pthread_sigmask, signal.SIG_BLOCK, ()) for _ in range(2)]
+    assert (spared.returncode, spared.stdout) == (0, "goes on\n")
+    assert all(signal.SIGINT in mask.result() for mask in masks)
+    assert subprocess.run(wait, capture_output=True, check=False).returncode != 0
+    with pytest.raises(KeyboardInterrupt):
+        signal.raise_signal(signal.SIGINT)
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no /dev/full")

@@ -40,7 +40,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if arguments is None:  # the program itself
         warnings.showwarning = OneLineWarnings(warnings.showwarning)
     with _ending_on_sigterm(), _signals_not_lost():
-        code = _ended(sys.argv[1:] if arguments is None else arguments)
+        code = exit_code(lambda: _run(sys.argv[1:] if arguments is None else arguments))
     if arguments is None:  # the program itself
         leave(code)
     return code
@@ -81,10 +81,10 @@ def _check_filled(arguments: Sequence[str]) -> None:
             raise UserError(f"{place}: is a variable of the shell not set?")
 
 
-def _ended(arguments: Sequence[str]) -> int:
+def exit_code(run: Callable[[], int]) -> int:
     """Run a command and return its exit code; errors that are the user's become a message."""
     try:
-        return _run(arguments)
+        return run()
     except UserError as error:
         print(f"tflane: {error}", file=sys.stderr)
         return 2
@@ -96,6 +96,9 @@ def _ended(arguments: Sequence[str]) -> int:
     except KeyboardInterrupt as error:
         print("tflane: stopped", file=sys.stderr)
         return 128 + getattr(error, "number", signal.SIGINT)
+    except MemoryError as error:
+        print(f"tflane: memory is full: {error or 'ask for less at a time'}", file=sys.stderr)
+        return 2
     except BrokenPipeError:  # `tflane ... | head`
         _drop_output()
         return 128 + signal.SIGPIPE

@@ -142,12 +142,13 @@ def test_examples_of_different_shapes_are_refused(tmp_path):
         build(tmp_path, UnevenDataset(FakeConfig()))
 
 
-def test_a_full_disk_is_one_message(tmp_path, monkeypatch):
+@pytest.mark.parametrize(("number", "said"), [(errno.ENOSPC, "No space left"), (errno.EFBIG, "File too large")])
+def test_a_full_disk_is_one_message(tmp_path, monkeypatch, number, said):
     def full(*_, **__):
-        raise OSError(errno.ENOSPC, "No space left on device")
+        raise OSError(number, os.strerror(number))
 
     monkeypatch.setattr(cache, "fill", full)
-    with pytest.raises(UserError, match=r"No space left.*TFLANE_CACHE"):
+    with pytest.raises(UserError, match=rf"cannot keep the dataset in .*: {said}.*TFLANE_CACHE"):
         build(tmp_path)
     assert entries(tmp_path) == []
 

@@ -172,7 +172,7 @@ def test_a_build_that_ends_while_the_cache_is_listed_is_no_fault(tmp_path, monke
     assert cache_entries(tmp_path) == []
 
 
-@pytest.mark.parametrize("named", ["~no_such_user_here/cache", "{file}", "{file}/below"])
+@pytest.mark.parametrize("named", ["~no_such_user_here/cache", "{file}", "{file}/below", "/proc/nothing"])
 def test_a_wrong_cache_folder_is_named(tmp_path, named, monkeypatch):
     (tmp_path / "file").touch()
     monkeypatch.setenv("TFLANE_CACHE", named.format(file=tmp_path / "file"))

@@ -74,6 +74,13 @@ def degrees_between(a, b):
     return np.rad2deg(np.arccos(np.clip(0.5 * (np.trace(a[:3, :3].T @ b[:3, :3]) - 1.0), -1.0, 1.0)))
 
 
+def test_an_image_too_large_to_enlarge_is_refused():
+    with pytest.raises(UserError, match=r"an image of 4000 x 3000 pixels enlarged 5 times .* enlarge it less"):
+        find_markers(np.zeros((3000, 4000), np.uint8), DetectorConfig(enlarge=5))
+    with pytest.raises(UserError, match="enlarge is 17"):
+        find_markers(np.zeros((9, 9), np.uint8), DetectorConfig(enlarge=17))
+
+
 @pytest.mark.parametrize("family", MarkerFamily)
 def test_patterns_have_a_black_border_and_differ(family):
     assert cells_across(family) == len(marker_cells(family, 0))

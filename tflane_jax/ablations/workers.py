@@ -22,7 +22,7 @@ from tflane_jax.ablations.jobs import Failure, Job
 from tflane_jax.ablations.reservations import Reservations
 from tflane_jax.ablations.scores import code_digest, is_measured, measure_all
 from tflane_jax.ablations.training_queue import Queue
-from tflane_jax.child_processes import end_with_parent
+from tflane_jax.child_processes import end_with_parent, spared_interrupts
 from tflane_jax.config_io import first_difference
 from tflane_jax.errors import Interrupted, UserError
 from tflane_jax.memory import give_back_freed_memory, huge_pages_for_children, keep_freed_memory
@@ -215,7 +215,7 @@ class Worker:
         self._pipe, far = context.Pipe()
         given = far, self._cores, self._accelerator
         self._process: Any = context.Process(target=_train_jobs, args=given, daemon=True)
-        with huge_pages_for_children():
+        with huge_pages_for_children(), spared_interrupts():
             self._process.start()
         far.close()  # so that reading fails, instead of waiting, once the process is gone
         self.tasks.clear()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -19,4 +20,13 @@ def run(options: argparse.Namespace) -> int:
         raise UserError(f"no benchmarks beside the package ({root}): run tflane bench from a source checkout")
     check_writable(options.out / "host.json")  # the first file, before minutes of measuring
     command = [sys.executable, "-m", "benchmarks", "--out", str(options.out.absolute())]
-    return subprocess.run(command, cwd=root, check=False).returncode
+    with subprocess.Popen(command, cwd=root) as process:
+        before = signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the benchmarks too, which say so
+        try:
+            code = process.wait()
+        except BaseException:
+            process.terminate()
+            raise
+        finally:
+            signal.signal(signal.SIGINT, before)
+    return code if code >= 0 else 128 - code

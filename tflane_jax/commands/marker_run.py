@@ -60,6 +60,7 @@ from tflane_jax.world.cameras.sensor import render_cameras
 from tflane_jax.world.roads.markers import PlacementConfig
 from tflane_jax.world.simulate import WorldConfig, simulate
 
+_MOST_FRAMES = 7000  # an hour
 _RINGS = {"argoverse2": ARGOVERSE2_RING, "nuscenes": NUSCENES_RING}
 
 
@@ -271,8 +272,8 @@ def _record(step: DriveStep, views: CameraViews, names: Sequence[str], threshold
 
 def render(options: argparse.Namespace) -> int:
     """Write a drive of the built-in world: images, poses.json and store.json."""
-    if options.frames < 1 or not options.scale > 0.0:
-        raise UserError("--frames must be at least 1 and --scale positive")
+    if not 1 <= options.frames <= _MOST_FRAMES or not options.scale > 0.0:
+        raise UserError(f"--frames must be from 1 to {_MOST_FRAMES} and --scale positive")
     surveyed = day_of(options.surveyed, "--surveyed")
     if options.log < 0:
         raise UserError(f"--log is the number of a scene, 0 or more, not {options.log}")

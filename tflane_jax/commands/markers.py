@@ -122,7 +122,10 @@ def curves(options: argparse.Namespace) -> int:
     if not options.sigma_d > 0.0:
         raise UserError(f"--sigma-d must be a positive distance in metres, not {options.sigma_d:g}")
     check_folder(options.out)
-    options.distances = list(dict.fromkeys(options.distances))
+    for name in ("distances", "scales", "corners"):
+        setattr(options, name, list(dict.fromkeys(getattr(options, name))))
+    if len(set(map("{:g}".format, options.scales))) < len(options.scales):
+        raise UserError(f"--scales {' '.join(map(str, options.scales))}: two of them have one name in tables and files")
     configs = {scale: [_curve(options, scale, corners) for corners in options.corners] for scale in options.scales}
     make_folder(options.out)
     drawn: dict[str, list[dict[str, Any]]] = {}

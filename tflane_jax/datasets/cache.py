@@ -37,7 +37,7 @@ from tflane_jax.scene import Example
 # Errors of a folder that cannot be a cache.
 _UNUSABLE = (
     *(errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR, errno.EISDIR, errno.EEXIST, errno.ENAMETOOLONG),
-    *(errno.ELOOP, errno.EIO, errno.ESTALE),
+    *(errno.ELOOP, errno.EIO, errno.ESTALE, errno.ENOENT, errno.EINVAL),
 )
 
 _UNGUARDED = (
@@ -298,11 +298,15 @@ def _only_builder(folder: Path) -> Iterator[bool]:
         yield alone
 
 
+def _is_below(name: Any, root: Path) -> bool:
+    return Path(os.fsdecode(name)).absolute().is_relative_to(root.absolute())
+
+
 def _explain(error: OSError, root: Path) -> Exception:
     """Return a UserError with a remedy for a failure to write below `root`; return any other error unchanged."""
-    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+    if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
         remedy = "free space there, ask for fewer scenes, or set TFLANE_CACHE to a folder on another disk"
-    elif error.errno in _UNUSABLE:
+    elif error.errno in _UNUSABLE and (error.filename is None or _is_below(error.filename, root)):
         remedy = "set TFLANE_CACHE to a folder that can be written"
     else:
         return error

@@ -242,6 +242,8 @@ def find_scene_files(root: Path) -> list[Path]:
     root = Path(root)
     if not root.exists():
         raise UserError(f"there is no {root}: name a scene file (npz) or a folder of them")
+    if root.is_file() and root.suffix != ".npz":
+        raise UserError(f"{root} is no scene file (npz), and no folder of them")
     found = [root] if root.is_file() else sorted(root.glob("*.npz"))
     if not found:
         raise UserError(f"{root} holds no scene file (*.npz)")

@@ -11,7 +11,6 @@ import contextlib
 import itertools
 import multiprocessing
 import os
-import signal
 import warnings
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -21,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tflane_jax.child_processes import end_with_parent
+from tflane_jax.child_processes import end_with_parent, spared_interrupts
 from tflane_jax.datasets.base import IndexedExamples
 from tflane_jax.datasets.leaves import example_leaves
 from tflane_jax.errors import UserError
@@ -134,7 +133,8 @@ def _run(job: _Job, blocks: list[range], workers: int) -> Iterator[tuple[range, 
     with _environment(_WORKER_ENVIRONMENT):
         pool = ProcessPoolExecutor(workers, context, _start_worker, (job,))
         try:
-            futures = {pool.submit(_write_block, block): block for block in blocks}
+            with spared_interrupts():  # submitting starts the processes
+                futures = {pool.submit(_write_block, block): block for block in blocks}
             for future in as_completed(futures):
                 names, warned = future.result()
                 for warning in warned:  # those of all workers, so that a text is shown once
@@ -197,8 +197,6 @@ _worker_job: _Job
 def _start_worker(job: _Job) -> None:
     global _worker_job
     _worker_job = job
-    # Ctrl-C reaches the whole process group; only the parent handles it and shuts the pool down.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
     end_with_parent()
 
 

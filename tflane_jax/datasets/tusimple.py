@@ -280,6 +280,8 @@ def _content(config: TuSimpleConfig) -> str:
 def check_tusimple(root: Path) -> FolderCheck:
     """Count the labelled frames of each split; faults are missing label files, images and malformed records."""
     rows, faults = [], []
+    if not root.is_dir():
+        raise UserError(f"{root} is no folder: name TuSimple's, with its label files and clips")
     for split in SPLITS:
         try:
             dataset = TuSimpleDataset(TuSimpleConfig(str(root), split))

@@ -12,14 +12,16 @@ from typing import Annotated, Any, Literal, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
+from tflane_jax.errors import UserError
 from tflane_jax.files.images import opencv
-from tflane_jax.limits import Count, CountOrZero, Fraction, Limit, Positive, check_settings
+from tflane_jax.limits import Count, CountOrZero, Fraction, Limit, Positive, check_settings, counted
 from tflane_jax.markers.corner_refinement import refine_corners
 from tflane_jax.markers.occluded_search import find_occluded
 from tflane_jax.scene.marker_patterns import BOARD_SIZES, MarkerFamily, dictionary_of, marker_cells
 
 # Window widths of OpenCV's adaptive threshold, pixels: its defaults.
 _WINDOWS = (3, 13, 23)
+_MOST_PIXELS = 200_000_000
 _LEAST, _MOST = BOARD_SIZES
 _BOARD_SIZE = Limit(f"from {_LEAST:g} to {_MOST:g} metres", lambda value: _LEAST <= value <= _MOST)
 
@@ -50,7 +52,7 @@ class DetectorConfig:
     size: Annotated[float, _BOARD_SIZE] = 1.0
     capacity: Count = 16
     corners: Literal["pattern", "subpixel", "none"] = "pattern"
-    enlarge: Count = 1
+    enlarge: Annotated[int, counted(1, 16)] = 1
     search: Literal["outlines", "all"] = "outlines"
     ids: tuple[CountOrZero, ...] | None = None
     least_pixels: Positive = 8.0
@@ -88,6 +90,11 @@ def find_markers(
         return ImageMarkers(np.zeros(0, int), np.zeros((0, 4, 2)), np.zeros(0, int))
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) if image.ndim == 3 else np.ascontiguousarray(image)
     if config.enlarge > 1:
+        if grey.size * config.enlarge**2 > _MOST_PIXELS:
+            raise UserError(
+                f"an image of {grey.shape[1]} x {grey.shape[0]} pixels enlarged {config.enlarge} times has more than "
+                f"{_MOST_PIXELS / 1e6:.0f} million: enlarge it less"
+            )
         grey = cv2.resize(grey, None, fx=config.enlarge, fy=config.enlarge, interpolation=cv2.INTER_CUBIC)
     # Against a bright sky some threshold windows merge the white margin with the square, and the outline is that of the
     # board. OpenCV prefers the outermost outline, so each width is tried separately and the best result is kept.

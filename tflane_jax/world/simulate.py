@@ -17,7 +17,7 @@ from jaxtyping import Float, Int
 
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import yaw_pose
-from tflane_jax.limits import Count, Fraction, Positive, PositiveOrZero, within
+from tflane_jax.limits import Count, Fraction, above_at_most, within
 from tflane_jax.scene.logs import KeyFrame, Log, Tracks, VectorMap
 from tflane_jax.world.cameras.marker_sites import visible_places
 from tflane_jax.world.excerpt import excerpt
@@ -86,9 +86,9 @@ class WorldConfig:
     tracker: TrackerConfig = TrackerConfig()
     markers: PlacementConfig = PlacementConfig()
     severity: Fraction = 0.5
-    duration_s: Positive = 8.0
-    rate_hz: Positive = 10.0
-    longer_s: PositiveOrZero = 0.0
+    duration_s: Annotated[float, above_at_most(0, 3600)] = 8.0
+    rate_hz: Annotated[float, above_at_most(0, 1000)] = 10.0
+    longer_s: Annotated[float, within(0, 3600)] = 0.0
     keyframes: Count = 4
     keyframe_spacing: Literal["time", "distance"] = "time"
     terrain: TerrainConfig | None = None

@@ -72,7 +72,7 @@ def test_seeds_are_a_number_or_a_list(text, seeds):
 @pytest.mark.parametrize("text", ["0", "", "-1", "3-1", "0,7-4", "1,", "1-2-3", "x", "²", "0-999999999", "9" * 5000])
 def test_other_seeds_are_refused(text, capsys):
     with pytest.raises(SystemExit) as ended:
-        main(["tables", "tf_lane.1", f"--seeds={text}"])
+        build_parser().parse_args(["tables", "tf_lane.1", f"--seeds={text}"])
     assert ended.value.code == 2
     assert "argument --seeds: " in capsys.readouterr().err
 

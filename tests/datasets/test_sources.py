@@ -273,6 +273,15 @@ def test_help_lists_the_sources_and_a_wrong_name_is_an_error(capsys):
     )
 
 
+@pytest.mark.parametrize("name", ["tusimple", "nuscenes-scenes"])
+def test_a_file_of_another_kind_is_no_dataset(name, tmp_path, capsys):
+    (tmp_path / "a.py").touch()
+    assert main(["data", "check", "--format", name, str(tmp_path / "a.py")]) == 2
+    out, said = capsys.readouterr()
+    assert out == ""
+    assert f"{tmp_path / 'a.py'} is no " in said
+
+
 def test_tusimples_folder_is_checked(tmp_path, capsys):
     pytest.importorskip("cv2")
     record = {"raw_file": "clips/a.jpg", "lanes": [[100, -2]], "h_samples": [700, 710]}

@@ -268,6 +268,24 @@ def test_a_newer_layout_is_refused(tmp_path, state):
         checkpoints.restore(1, state)
 
 
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        (lambda content: content | {"step": 2}, "step"),
+        (lambda content: content | {"version": "one"}, "version"),
+        (lambda content: content | {"notes": "mine"}, "notes"),
+        (lambda content: {name: value for name, value in content.items() if name != "config"}, "config"),
+        (lambda content: [content], "it"),
+    ],
+)
+def test_an_entry_that_was_not_written_so_is_named(tmp_path, state, change, named):
+    checkpoints = saved(tmp_path, state, [(1, None)])
+    path = checkpoints.path(1) / "manifest.json"
+    path.write_text(json.dumps(change(json.loads(path.read_text()))))
+    with pytest.raises(UserError, match=rf"damaged \(manifest.json: {named} is not what was written\)"):
+        checkpoints.manifest(1)
+
+
 def test_a_full_disk_is_a_message_and_leaves_nothing(tmp_path, state, monkeypatch):
     def full(*_):
         raise OSError(28, "No space left on device")

@@ -15,6 +15,7 @@ import re
 import shutil
 import time
 import zlib
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -145,16 +146,14 @@ class Checkpoints:
         """Return the description of a checkpoint; raises UserError if it is damaged or cannot be read."""
         try:
             content = json.loads((self.path(step) / "manifest.json").read_text(encoding="utf-8"))
-            manifest = Manifest(**content)
         except Exception as error:
             raise self._unreadable(step, error, "manifest.json: ") from error
-        if (wrong := _wrong_entry(manifest)) is not None:
+        version = content.get("version") if isinstance(content, dict) else None
+        if type(version) is int and version != _VERSION:
+            raise UserError(f"checkpoint {self.path(step)} has layout version {version}, this program reads {_VERSION}")
+        if wrong := _wrong_entry(content, step):
             raise self._damaged(step, f"manifest.json: {wrong} is not what was written")
-        if manifest.version != _VERSION:
-            raise UserError(
-                f"checkpoint {self.path(step)} has layout version {manifest.version}, this program reads {_VERSION}"
-            )
-        return manifest
+        return Manifest(**content)
 
     def find(self, which: Which) -> int:
         """Return the step of a checkpoint; raises UserError, with a list of those that exist, if there is none."""
@@ -255,7 +254,7 @@ class Checkpoints:
 
     def damaged_progress(self, step: int, error: Exception) -> UserError:
         """Return the error for a checkpoint whose entry "progress" the loop cannot read."""
-        return self._damaged(step, f"manifest.json: progress: {type(error).__name__}: {error}")
+        return self._damaged(step, f"manifest.json: progress is not what was written: {first_line(error)}")
 
     def _unreadable(self, step: int, error: Exception, what: str = "") -> UserError:
         """Return the error for a checkpoint whose reading failed; it may be whole, unless its content is the cause."""
@@ -292,21 +291,24 @@ def _sum_of(config: dict[str, Any]) -> int:
     return zlib.crc32(json.dumps(config, sort_keys=True).encode())
 
 
-def _wrong_entry(manifest: Manifest) -> str | None:
-    """Return the name of the first entry with a value of the wrong type, None where all are right."""
-    numbers = {"metrics": manifest.metrics, "files": manifest.files}
-    right = {
-        "step": type(manifest.step) is int,
-        "version": type(manifest.version) is int,
-        "config": isinstance(manifest.config, dict),
-        "progress": isinstance(manifest.progress, dict),
-        **{name: isinstance(entry, dict) and all(map(_is_number, entry.values())) for name, entry in numbers.items()},
+def _wrong_entry(content: Any, step: int) -> str | None:
+    """Return the name of the first entry of a manifest (JSON) that is absent, unknown or wrong, None for none."""
+    if not isinstance(content, dict):
+        return "it"
+    fits: dict[str, Callable[[Any], bool]] = {
+        "step": lambda value: type(value) is int and value == step,
+        "version": lambda value: value == _VERSION,
+        **dict.fromkeys(("config", "progress"), lambda value: isinstance(value, dict)),
+        **dict.fromkeys(("metrics", "files"), _holds_numbers),
     }
-    return next((name for name, fits in right.items() if not fits), None)
+    names = ("step", "config", *content)  # the others have defaults
+    return next((name for name in names if name not in fits or not fits[name](content.get(name))), None)
 
 
-def _is_number(value: Any) -> bool:
-    return type(value) is float or (type(value) is int and abs(value) < 2**63)
+def _holds_numbers(value: Any) -> bool:
+    return isinstance(value, dict) and all(
+        type(v) is float or (type(v) is int and abs(v) < 2**63) for v in value.values()
+    )
 
 
 def _checksums(folder: Path) -> dict[str, int]:

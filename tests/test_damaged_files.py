@@ -23,8 +23,9 @@ from tflane_jax.files.atomic import write_json
 from tflane_jax.runs import open_run, resumable_config
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.training import array_files, checkpoint, provenance, run_folder
-from tflane_jax.training.checkpoint import Checkpoints, Manifest
+from tflane_jax.training.checkpoint import Checkpoints
 from tflane_jax.training.loop import WRONG_PROGRESS, _carried
+from tflane_jax.training.manifest import Manifest
 from tflane_jax.training.records import RecordWriter, read_records
 from tflane_jax.training.schedule import OptimConfig, make_optimizer
 from tflane_jax.training.state import init_states

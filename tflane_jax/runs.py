@@ -32,9 +32,10 @@ from tflane_jax.models.parameters import Params
 from tflane_jax.processes import agreed, from_first, is_first
 from tflane_jax.run_checks import check_model, check_origin_model, check_rate_factors, check_run
 from tflane_jax.startup import showing, stage
-from tflane_jax.training.checkpoint import Checkpoints, Manifest, Which
+from tflane_jax.training.checkpoint import Checkpoints, Which
 from tflane_jax.training.fine_tuning import check_origins
 from tflane_jax.training.loop import Draw, TrainingResult, train
+from tflane_jax.training.manifest import Manifest
 from tflane_jax.training.provenance import add_provenance
 from tflane_jax.training.records import Record, by_name
 from tflane_jax.training.run_folder import Start, check_start, check_unchanged, claimed, read_config, unused_changes

@@ -15,7 +15,8 @@ import pytest
 from tests.training.stub import LineTask, line_arrays
 from tflane_jax.errors import UserError
 from tflane_jax.models.parameters import split_statistics
-from tflane_jax.training.checkpoint import Checkpoints, Manifest
+from tflane_jax.training.checkpoint import Checkpoints
+from tflane_jax.training.manifest import Manifest
 from tflane_jax.training.schedule import OptimConfig, make_optimizer
 from tflane_jax.training.state import init_states, of_all_seeds, tree_of
 from tflane_jax.training.vectors import ravel

@@ -15,8 +15,7 @@ import re
 import shutil
 import time
 import zlib
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -28,9 +27,9 @@ from flax.traverse_util import unflatten_dict
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import is_temporary, rename_flushed
 from tflane_jax.training.array_files import first_line, flat, load_arrays, save_arrays, system_error
+from tflane_jax.training.manifest import VERSION, Manifest, wrong_entry
 from tflane_jax.training.state import TrainState, state_from, tree_of
 
-_VERSION = 1
 # In `Manifest.progress`, where versions that do not know it leave it alone: the checksum of the configuration.
 _CONFIG_SUM = "config_sum"
 Which = int | Literal["last", "best"]
@@ -50,27 +49,6 @@ _REMEDIES = {
 
 class _DamagedError(UserError):
     """The content of a checkpoint is not what was written."""
-
-
-@dataclass(frozen=True)
-class Manifest:
-    """Description of a checkpoint.
-
-    Attributes:
-        step: updates made.
-        config: the run's resolved configuration, plain JSON.
-        metrics: of the evaluation at this step; empty where there was none.
-        progress: what the loop restores beside the state, so that a resumed run gives the same records.
-        files: CRC-32 of every file of the state, by path relative to the checkpoint.
-        version: of this layout.
-    """
-
-    step: int
-    config: dict[str, Any]
-    metrics: dict[str, float] = field(default_factory=dict)
-    progress: dict[str, Any] = field(default_factory=dict)
-    files: dict[str, int] = field(default_factory=dict)
-    version: int = _VERSION
 
 
 class Checkpoints:
@@ -149,9 +127,9 @@ class Checkpoints:
         except Exception as error:
             raise self._unreadable(step, error, "manifest.json: ") from error
         version = content.get("version") if isinstance(content, dict) else None
-        if type(version) is int and version != _VERSION:
-            raise UserError(f"checkpoint {self.path(step)} has layout version {version}, this program reads {_VERSION}")
-        if wrong := _wrong_entry(content, step):
+        if type(version) is int and version != VERSION:
+            raise UserError(f"checkpoint {self.path(step)} has layout version {version}, this program reads {VERSION}")
+        if wrong := wrong_entry(content, step):
             raise self._damaged(step, f"manifest.json: {wrong} is not what was written")
         return Manifest(**content)
 
@@ -289,26 +267,6 @@ def _remove_unfinished(folder: Path) -> None:
 
 def _sum_of(config: dict[str, Any]) -> int:
     return zlib.crc32(json.dumps(config, sort_keys=True).encode())
-
-
-def _wrong_entry(content: Any, step: int) -> str | None:
-    """Return the name of the first entry of a manifest (JSON) that is absent, unknown or wrong, None for none."""
-    if not isinstance(content, dict):
-        return "it"
-    fits: dict[str, Callable[[Any], bool]] = {
-        "step": lambda value: type(value) is int and value == step,
-        "version": lambda value: value == _VERSION,
-        **dict.fromkeys(("config", "progress"), lambda value: isinstance(value, dict)),
-        **dict.fromkeys(("metrics", "files"), _holds_numbers),
-    }
-    names = ("step", "config", *content)  # the others have defaults
-    return next((name for name in names if name not in fits or not fits[name](content.get(name))), None)
-
-
-def _holds_numbers(value: Any) -> bool:
-    return isinstance(value, dict) and all(
-        type(v) is float or (type(v) is int and abs(v) < 2**63) for v in value.values()
-    )
 
 
 def _checksums(folder: Path) -> dict[str, int]:

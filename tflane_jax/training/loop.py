@@ -26,9 +26,10 @@ from tflane_jax.processes import AgreedError, agreed, apart, arrays_from_first, 
 from tflane_jax.progress import progress_bar
 from tflane_jax.startup import ready, showing, stage
 from tflane_jax.training.adaptive import Memory
-from tflane_jax.training.checkpoint import Checkpoints, Manifest
+from tflane_jax.training.checkpoint import Checkpoints
 from tflane_jax.training.fine_tuning import origins, starting_params
 from tflane_jax.training.interrupt import StopRequest
+from tflane_jax.training.manifest import Manifest
 from tflane_jax.training.notices import NO_BEST, due_notices, not_finite, only_told, print_notices
 from tflane_jax.training.records import Record, RecordWriter, Unwritten, Window, by_name, read_records, seed_record
 from tflane_jax.training.restarts import adapt

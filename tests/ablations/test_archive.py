@@ -283,6 +283,29 @@ def test_a_recorded_row_needs_no_host(tiny, tmp_path, monkeypatch):
     assert [job.recorded is None for jobs in plan.jobs.values() for job in jobs] == [False, True] * 2
 
 
+@pytest.mark.parametrize("same", [True, False])
+def test_rows_from_two_trainings_of_a_host_are_told(tiny, tmp_path, capsys, same):
+    """On another kind of processor the same host becomes another one."""
+    base, again = (
+        TableRow(name, f"{tiny}:{of}", start="host") for name, of in (("base", "baseline"), ("again", "again"))
+    )
+    table = small(tiny, rows=(base,), claims=(Claim("base", "base"),), hosts=(TableRow("host", f"{tiny}:host"),))
+    run_table(table, range(1), tmp_path / "a")
+    archive = find_archives(tmp_path / "a", ["paper.9"])["paper.9"]
+    if not same:
+        ((key, run),) = archive.runs.items()
+        archive = replace(archive, runs={key: replace(run, facts=replace(run.facts, origins=("of another machine",)))})
+    capsys.readouterr()
+    run_table(replace(table, rows=(base, again)), range(1), tmp_path / "b", archive=archive)
+    assert "recorded runs of seed 0 start from an earlier training of host, the others from" in capsys.readouterr().out
+    told = json.loads((tmp_path / "b" / "paper.9" / "summary.json").read_text())["mixed hosts"]
+    mixed = "Rows of seed 0 start from different trainings of host: differences hold those of the hosts, too."
+    assert told == ([] if same else [mixed])
+    record([tmp_path / "b" / "paper.9" / "summary.json"], tmp_path / "results")
+    page = " ".join((tmp_path / "results.md").read_text().split())
+    assert (mixed in page) is not same
+
+
 def test_scores_by_an_earlier_state_of_the_code_may_stay(tiny, made, tmp_path, monkeypatch):
     shutil.copytree(made, tmp_path, dirs_exist_ok=True)
     monkeypatch.setattr("tflane_jax.ablations.scores.code_digest", lambda: OTHER_CODE)

@@ -21,7 +21,7 @@ SAMPLES = {
     way: {"all/DET_l": SceneSamples((3, 4), (0.12345, value))} for way, value in (("", 1.0), ("no traffic", 0.3))
 }
 LAST = Measured(4, "a protocol, 2 m", WAYS, RATIOS, "c" * 64, SAMPLES)
-FACTS = Facts(("9ea6749b4",), ("cpu: cpu x 1",), 61.5, ({"step": 2, "split": "val", "all/recall": 0.25},))
+FACTS = Facts(("9ea6749b4",), ("cpu: cpu x 1",), 61.5, ({"step": 2, "split": "val", "all/recall": 0.25},), ("c0ffee",))
 RUN = RecordedRun(
     key="0123456789abcdef",
     row="TopoNet + TFM",

@@ -142,6 +142,7 @@ def write_archive(path: Path, archive: Archive) -> Path:
             "devices": list(run.facts.devices),
             "seconds": run.facts.seconds,
             "validation": list(run.facts.validation),
+            **({"origins": list(run.facts.origins)} if run.facts.origins else {}),
             "measured": {name: entry(measured) for name, measured in run.measured.items()},
         }
         for key, run in sorted(archive.runs.items(), key=lambda item: (item[1].row, item[1].seed, item[0]))
@@ -283,6 +284,7 @@ def _run(key: str, run: Any, configs: Sequence[Any], entries: Sequence[Measured]
             devices=texts("devices"),
             seconds=None if seconds is None else float(_number(seconds, f"{where}: seconds")),
             validation=tuple(_validation(record, f"{where}: validation {i}") for i, record in records),
+            origins=texts("origins") if "origins" in run else (),
         ),
         measured={
             _text(name, where): None if place is None else _chosen(entries, place, f"{where}: {name[:_LONGEST_TEXT]}")

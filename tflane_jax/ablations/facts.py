@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 from tflane_jax.ablations.jobs import Job
+from tflane_jax.ablations.paper.table import TableRow
 from tflane_jax.ablations.recorded import Facts
 from tflane_jax.training.provenance import commit_of, read_provenance
 from tflane_jax.training.records import read_records
@@ -21,7 +23,34 @@ def facts(job: Job) -> Facts:
         devices=tuple(sorted({start["device"] for start in starts})),
         seconds=seconds[-1] if seconds else None,
         validation=tuple(record for record in records if record["split"] == "val"),
+        origins=tuple(sorted({_hash(origin) for start in starts for origin in start.get("init_from", ())})),
     )
+
+
+def _hash(origin: Mapping[str, Any]) -> str:
+    """Return the hash of what a run started from: of the parameters, or of the files in earlier runs."""
+    return origin.get("parameters", origin["content"])
+
+
+def mixed_hosts(rows: Sequence[TableRow], trained: Mapping[str, Sequence[Job]]) -> list[str]:
+    """Return a sentence for each host of which the rows of a seed do not all start from one training.
+
+    A host that is trained on two kinds of processors differs in the last bits first, and then in its scores, so that
+    such rows differ in more than what the table compares. Rows whose start is not recorded count as others.
+    """
+    found: dict[str, dict[int, set[tuple[str, ...]]]] = {}
+    for row in rows:
+        for job in trained.get(row.name, ()) if row.start else ():
+            (seed,) = job.config.training.seeds
+            found.setdefault(row.start, {}).setdefault(seed, set()).add(facts(job).origins)
+    sentences = []
+    for host, by_seed in found.items():
+        if mixed := sorted(seed for seed, origins in by_seed.items() if len(origins) > 1):
+            seeds = f"seed{'s' if len(mixed) > 1 else ''} {', '.join(map(str, mixed))}"
+            sentences.append(
+                f"Rows of {seeds} start from different trainings of {host}: differences hold those of the hosts, too."
+            )
+    return sentences
 
 
 def row_minutes(trained: Mapping[str, Sequence[Job]]) -> dict[str, float]:

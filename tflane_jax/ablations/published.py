@@ -107,6 +107,7 @@ def _section(summary: Mapping[str, Any], note: str | None) -> list[str]:
         f"{summary['protocol']}, test split of the built-in world, percent (mean ± std over seeds). "
         f"{summary['declared']}{_interim(summary)}"
     )
+    facts = " ".join([facts, *summary.get("mixed hosts", ())])
     lines = [
         f"## {summary['table']}: {summary['title']}",
         "",

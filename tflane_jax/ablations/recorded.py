@@ -44,12 +44,14 @@ class Facts:
         devices: that trained it, in order.
         seconds: of all updates, without evaluation and compiling; None if the run has no record of it.
         validation: records of the validation split, see `training.records`.
+        origins: hashes of the checkpoints that it started from; () for random parameters, and in earlier records.
     """
 
     commits: tuple[str, ...]
     devices: tuple[str, ...]
     seconds: float | None
     validation: tuple[Record, ...]
+    origins: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -135,6 +135,22 @@ def seed_by_seed(plan: Mapping[str, Sequence[Job]]) -> list[Job]:
     return list({job.folder: job for job in every}.values())
 
 
+def _other_hosts(plan: TablePlan) -> list[str]:
+    """Return a notice for each host from which recorded runs and runs to be trained of one seed start."""
+    found: dict[str, dict[int, set[bool]]] = {}
+    for row in plan.table.rows:
+        for job in plan.jobs[row.name] if row.start else ():
+            if job.recorded is not None or not job.is_complete():
+                by_seed = found.setdefault(row.start, {})
+                by_seed.setdefault(job.config.training.seeds[0], set()).add(job.recorded is not None)
+    return [
+        f"recorded runs of seed{'s' if len(mixed) > 1 else ''} {', '.join(map(str, mixed))} start from an earlier "
+        f"training of {host}, the others from one of this machine, which may differ: without --from, all start from one"
+        for host, by_seed in found.items()
+        if (mixed := sorted(seed for seed, kinds in by_seed.items() if len(kinds) > 1))
+    ]
+
+
 def tell_work(plan: TablePlan, seeds: Sequence[int], store: Path, jobs: int, *, quick: bool = False) -> None:
     """Print how many runs are complete, how long the others take, and which exist with other thread settings.
 
@@ -158,6 +174,8 @@ def tell_work(plan: TablePlan, seeds: Sequence[int], store: Path, jobs: int, *, 
         text += f"; the updates of the others take about {_duration(seconds / jobs)} ({jobs} at a time; {basis}), "
         text += "evaluation and compiling come on top"
     print(text, flush=True)
+    for line in _other_hosts(plan):
+        print(line, flush=True)
 
     def replan(threads: Mapping[str, Any]) -> list[Job]:
         return _planned(table, plan.rows, plan.hosts, seeds, store, threads).every()

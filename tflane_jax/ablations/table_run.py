@@ -26,7 +26,7 @@ from tflane_jax.ablations.comparison import compact
 from tflane_jax.ablations.declaration import FILE as DECLARATION
 from tflane_jax.ablations.declaration import Declared, declare
 from tflane_jax.ablations.effects import Tested, judged_claims
-from tflane_jax.ablations.facts import facts, row_minutes
+from tflane_jax.ablations.facts import facts, mixed_hosts, row_minutes
 from tflane_jax.ablations.findings import findings, save_effects
 from tflane_jax.ablations.finished_runs import (
     commits,
@@ -324,6 +324,7 @@ def _save_summary(
             "steps": {name: jobs[0].config.training.steps for name, jobs in trained.items() if jobs},
             "cores of a run": sorted({job.threads["cores"] for job in runs}),
             "commits": [*commits(runs), *_measured_elsewhere(runs)],
+            "mixed hosts": mixed_hosts(table.rows, trained),
             "devices": sorted({device for job in runs for device in facts(job).devices}),
             "core minutes of a run": row_minutes(trained),
             "rows": _rows(table, results),

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 from flax.traverse_util import unflatten_dict
 
 from tflane_jax.errors import UserError
@@ -64,14 +66,25 @@ def check_origins(reference: str, seeds: Sequence[int]) -> None:
             ) from error
 
 
-def origins(reference: str, seeds: Sequence[int]) -> list[dict[str, Any]]:
-    """Return folder, step, seed and content of the checkpoint that each seed starts from, see `starting_params`."""
+def origins(reference: str, seeds: Sequence[int], *, read: bool = False) -> list[dict[str, Any]]:
+    """Return folder, step, seed and content of the checkpoint that each seed starts from, see `starting_params`.
+
+    "content" is a hash of its files, which differ between equal trainings; with `read`, "parameters" is one of values.
+    """
     found = []
     for folder, seed in zip(origin_folders(reference, seeds), seeds, strict=True):
         checkpoints, step, theirs = _starting_checkpoint(folder)
         place = {"run": str(folder), "step": step, "seed": theirs[_place(seed, theirs)]}
-        found.append(place | {"content": checkpoints.content(step)})
+        values = {"parameters": _digest(checkpoints.params(step))} if read else {}
+        found.append(place | {"content": checkpoints.content(step)} | values)
     return found
+
+
+def _digest(params: Params) -> str:
+    digest = hashlib.sha256()
+    for name, value in sorted(flat(params).items()):
+        digest.update(f"{name} {value.dtype} {value.shape}".encode() + np.ascontiguousarray(value).tobytes())
+    return digest.hexdigest()
 
 
 def origin_folders(reference: str, seeds: Sequence[int]) -> list[Path]:

@@ -205,6 +205,21 @@ def test_an_own_class_has_a_name_of_its_own(monkeypatch):
     assert own.__mro__[1] is Base
 
 
+def test_two_files_do_not_define_one_class(monkeypatch):
+    """Regression: a run was read back with the class of the copy that was imported last."""
+    for number in (1, 2):
+        Path(f"variant{number}.py").write_text(LOSS.format(name="VariantLossConfig"))
+    first, second = (own_modules.import_file(Path(f"variant{number}.py")) for number in (1, 2))
+    with pytest.raises(UserError, match=r"class VariantLossConfig is defined in .*variant1\.py and in .*variant2\.py"):
+        subclasses(first.VariantLossConfig.__mro__[2])
+    assert own_modules.own_code(first.VariantLossConfig()) == own_modules.own_code(second.VariantLossConfig()) != ""
+    del sys.modules[second.__name__]
+    Path("variant1.py").write_text(f"{LOSS.format(name='VariantLossConfig')}# edited")
+    edited = own_modules.import_file(Path("variant1.py"))
+    assert subclasses(first.VariantLossConfig.__mro__[2])["VariantLossConfig"] is edited.VariantLossConfig
+    assert own_modules.own_code(edited.VariantLossConfig()) != own_modules.own_code(first.VariantLossConfig())
+
+
 def test_the_own_loss_of_the_page_adds_its_term(monkeypatch):
     page = (ROOT / "docs" / "architecture.md").read_text("utf-8")
     (code,) = [block for block in re.findall(r"^```python\n(.*?)^```", page, re.S | re.M) if "SmoothLoss" in block]

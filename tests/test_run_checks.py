@@ -11,14 +11,15 @@ import pytest
 from tflane_jax import devices, runs
 from tflane_jax.cli import main
 from tflane_jax.config import RunConfig, load_config
-from tflane_jax.config_io import with_setting
+from tflane_jax.config_io import to_json, with_setting
 from tflane_jax.config_overrides import apply_overrides
 from tflane_jax.datasets import sources
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.limits import SettingError
-from tflane_jax.run_checks import check_run
+from tflane_jax.run_checks import agree_on_settings, check_run
 from tflane_jax.training.restarts import RestartsConfig
+from tflane_jax.training.run_folder import fixed
 from tflane_jax.training.schedule import DropsConfig
 
 NAN, INF = math.nan, math.inf
@@ -296,3 +297,19 @@ def test_a_batch_that_devices_cannot_share_is_refused_before_data_are_built(tmp_
     with pytest.raises(UserError, match=r"training\.batch_size is 8, which 3 devices cannot share evenly"):
         runs.train_run(loaded(""), tmp_path / "run", progress=False)
     assert not (tmp_path / "run").exists()
+
+
+def test_processes_with_other_settings_or_code_are_told(monkeypatch):
+    """Regression: they trained one wrong model together, or waited for each other for ever."""
+    config = load_config("tf_lane/toponet_tfm")
+    agree_on_settings(config)
+
+    def first_has(**other):
+        monkeypatch.setattr("tflane_jax.run_checks.from_first", lambda found: found() | other)
+
+    first_has(settings=fixed(to_json(with_setting(config, "optim.lr", 0.5))))
+    with pytest.raises(UserError, match=r"not those of the first process \(optim\.lr: 0\.5 there, .* here\)"):
+        agree_on_settings(config)
+    first_has(code="another")
+    with pytest.raises(UserError, match="own classes have other code than those of the first process"):
+        agree_on_settings(config)

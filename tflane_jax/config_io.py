@@ -13,6 +13,7 @@ import enum
 import functools
 import importlib
 import json
+import os
 import pkgutil
 import sys
 import types
@@ -83,7 +84,7 @@ def subclasses(kind: type) -> dict[str, type]:
     with one name, the latest.
 
     Raises:
-        UserError: an own class has the name of a shipped one.
+        UserError: an own class has the name of a shipped one, or of an own one in another file.
     """
     if _is_abstract(kind):
         _import_all(kind.__module__.rpartition(".")[0])
@@ -92,13 +93,26 @@ def subclasses(kind: type) -> dict[str, type]:
         each = waiting.pop(0)
         waiting += [c for c in each.__subclasses__() if c.__module__ in sys.modules]  # others: the import has failed
         shipped = found.get(each.__name__)
+        if shipped is each:
+            continue
         if shipped is not None and shipped.__module__.startswith("tflane_jax."):
             raise UserError(
                 f"class {each.__name__} of {each.__module__} is called like one of tflane_jax: give it another name, "
                 "because runs are read back by it"
             )
+        if shipped is not None and (file := _file_of(each)) != (other := _file_of(shipped)):
+            raise UserError(
+                f"class {each.__name__} is defined in {other} and in {file}: give one another name, because runs are "
+                "read back by it"
+            )
         found[each.__name__] = each
     return found
+
+
+def _file_of(kind: type) -> str:
+    """Return the file that defines a class, or the module of a notebook or prompt."""
+    file = getattr(sys.modules[kind.__module__], "__file__", None)
+    return kind.__module__ if file is None else os.path.realpath(file)
 
 
 @functools.cache

@@ -124,13 +124,26 @@ def own_content(config: Any) -> str:
     return hashlib.sha256("".join(map(_content, modules)).encode()).hexdigest() if modules else ""
 
 
+def own_code(config: Any) -> str:
+    """Return the hash of the code that defines a configuration's own classes, wherever the files lie; "" for none."""
+    modules = {kind.__module__ for kind in _classes(config) if _is_own(kind)}
+    hashes = sorted(filter(None, map(_code_of, modules)))
+    return hashlib.sha256("".join(hashes).encode()).hexdigest() if hashes else ""
+
+
+@functools.cache
+def _code_of(module: str) -> str:
+    """Return the hash of a module's file when it was first asked for: one edited later is not the code that runs."""
+    file = getattr(sys.modules[module], "__file__", None)
+    return "" if file is None else hashlib.sha256(Path(file).read_bytes()).hexdigest()
+
+
 @functools.cache
 def _content(module: str) -> str:
     """Return what tells the code of a module from its other states, of one that is edited later the code that runs."""
     if module.startswith(_PREFIX):  # its name does
         return module
-    file = sys.modules[module].__file__
-    return "" if file is None else hashlib.sha256(Path(file).read_bytes()).hexdigest()
+    return _code_of(module)
 
 
 def _is_own(kind: type) -> bool:

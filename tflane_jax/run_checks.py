@@ -9,21 +9,40 @@ from typing import Any
 import jax
 
 from tflane_jax.config import RunConfig
-from tflane_jax.config_io import settings
+from tflane_jax.config_io import first_difference, settings, to_json
 from tflane_jax.datasets.sources import source_of
 from tflane_jax.errors import UserError
 from tflane_jax.limits import SettingError, check_settings
 from tflane_jax.metrics.directions import lower_is_better
 from tflane_jax.models.parameters import Params, first_misfit, split_statistics
+from tflane_jax.own_modules import own_code
+from tflane_jax.processes import agreed, from_first
 from tflane_jax.scene import Example, RoadImage, shapes_of
 from tflane_jax.tasks.base import AnyTask
 from tflane_jax.tasks.lane_shape import LaneShapeTask
 from tflane_jax.training.fine_tuning import check_origin_params
 from tflane_jax.training.rate_factors import factor_of_leaves
+from tflane_jax.training.run_folder import fixed
 from tflane_jax.training.vectors import layout_of
 
 EXAMPLE_NAMES = {Example: "lane graphs", RoadImage: "images"}
 """Kinds of examples, in words."""
+
+
+def agree_on_settings(config: RunConfig) -> None:
+    """Raise UserError, in all processes, where one has other settings, or other code of own classes, than the first.
+
+    Each would take part in every update with a program of its own, or wait for ever for an evaluation of the others.
+    """
+    mine = {"settings": fixed(to_json(config)), "code": own_code(config)}
+    first = from_first(lambda: mine)
+    with agreed():
+        if difference := first_difference(first["settings"], mine["settings"]):
+            raise UserError(
+                f"its settings are not those of the first process ({difference}): give all processes the same command"
+            )
+        if mine["code"] != first["code"]:
+            raise UserError("its own classes have other code than those of the first process: give all the same files")
 
 
 def check_run(config: RunConfig) -> None:

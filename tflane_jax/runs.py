@@ -30,7 +30,7 @@ from tflane_jax.limits import check_settings
 from tflane_jax.migrations import migrate
 from tflane_jax.models.parameters import Params
 from tflane_jax.processes import agreed, from_first, is_first
-from tflane_jax.run_checks import check_model, check_origin_model, check_rate_factors, check_run
+from tflane_jax.run_checks import agree_on_settings, check_model, check_origin_model, check_rate_factors, check_run
 from tflane_jax.startup import showing, stage
 from tflane_jax.training.checkpoint import Checkpoints, Which
 from tflane_jax.training.fine_tuning import check_origins
@@ -89,6 +89,7 @@ def train_run(
     folder = Path(folder)
     # All this before building data, which may take long.
     from_first(lambda: check_start(folder, start))
+    agree_on_settings(config)
     with agreed():
         check_run(config)
         training_mesh(config.training.batch_size, config.training.accumulate)

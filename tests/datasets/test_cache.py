@@ -138,7 +138,7 @@ def test_a_worker_that_dies_is_explained(tmp_path, monkeypatch):
 
 
 def test_examples_of_different_shapes_are_refused(tmp_path):
-    with pytest.raises(ValueError, match=r"bev is .* in example 1 and .* in example 0"):
+    with pytest.raises(UserError, match=r"bev is .* in example 1 and .* in example 0"):
         build(tmp_path, UnevenDataset(FakeConfig()))
 
 

@@ -103,5 +103,59 @@ def test_an_empty_dataset_and_uneven_examples_are_refused():
         load(FakeDataset(FakeConfig(size=0)))
     with pytest.raises(UserError, match="no examples"):
         load_or_stream(FakeDataset(FakeConfig(size=0)), False, ("lanes",), StreamingConfig(where="disk"))
-    with pytest.raises(ValueError, match="bev is"):
+    with pytest.raises(UserError, match="bev is"):
         load(UnevenDataset(FakeConfig()))
+
+
+class Changed(FakeDataset):
+    """A dataset with another example at one place."""
+
+    place = 2
+
+    def changed(self, example: Example) -> Example:
+        return example.replace(traffic_flow=None)
+
+    def example(self, index: int) -> Example:
+        example = super().example(index)
+        return self.changed(example) if index == self.place else example
+
+
+class Converted(Changed):
+    def changed(self, example: Example) -> Example:
+        return example.replace(bev=np.asarray(example.bev, np.float32) / 255.0)
+
+
+class Misfit(Changed):
+    place = 0
+
+    def changed(self, example: Example) -> Example:
+        return example.replace(lanes=example.lanes.replace(successor=np.zeros((3, 3), bool)))
+
+
+class AbsentAtFirst(Changed):
+    place = 0
+
+
+@pytest.mark.parametrize(
+    ("kind", "said"),
+    [
+        (Changed, r"traffic_flow\.\w+ is absent in example 2 and \w+ of shape .* in example 0"),
+        (AbsentAtFirst, r"traffic_flow\.\w+ is \w+ of shape .* in example 1 and absent in example 0"),
+        (Converted, "bev is float32 of shape .* in example 2 and uint8 of shape"),
+        (Misfit, r"in example 0, lanes\.successor is of shape \(3, 3\), expected"),
+    ],
+)
+def test_examples_that_do_not_stack_are_named(kind, said):
+    """Regression: an absent part was memory that nobody had written, another type was converted."""
+    dataset = kind(FakeConfig(size=5))
+    with pytest.raises(UserError, match=said):
+        load(dataset)
+
+    def stream_all():
+        streamed = load_or_stream(dataset, False, TRAINING_PARTS, StreamingConfig(where="disk"))
+        assert isinstance(streamed, Streamed)
+        for index in range(len(dataset)):
+            streamed.example(index)
+
+    with pytest.raises(UserError, match=said):
+        stream_all()

@@ -21,9 +21,10 @@ from tests.models.cases import (
 from tests.models.toy_prior import CrossingsConfig, with_crossings
 from tests.parameters import random_params
 from tests.shared import assert_same
+from tflane_jax.errors import UserError
 from tflane_jax.limits import Rules, SettingError, splits
 from tflane_jax.models.bevformer_detr import BevFormerDetrConfig
-from tflane_jax.models.prior import HostQueries, HostSpec
+from tflane_jax.models.prior import HostQueries, HostSpec, Prior
 from tflane_jax.models.priors import PriorsConfig, encode, fuse_into_queries, observe, observe_clip
 from tflane_jax.models.traffic_flow_module import TrafficFlowConfig, TrafficFlowModuleConfig
 from tflane_jax.priors.traffic_flow import TrafficFlowPriorConfig
@@ -133,6 +134,19 @@ def test_memories_go_from_frame_to_frame_of_a_clip_and_of_a_stream():
     _, answers = jax.jit(lambda p, c: lax.scan(lambda m, e: task.step(p, m, e), task.start(), c))(params, clip)
     alone = jax.jit(task.predict)(params, frames[2])
     assert not np.array_equal(answers.centerlines.points[2], alone.centerlines.points)
+
+
+@pytest.mark.parametrize(("found", "shown"), [(jnp.zeros((6, 1)), r"an array of shape \(6, 1\)"), (None, "NoneType")])
+def test_what_a_prior_makes_of_the_queries_has_their_shape(found, shown):
+    """Regression: one channel was broadcast to all."""
+
+    class Careless(Prior):
+        def into_queries(self, tokens, layer, queries):
+            return found
+
+    queries = HostQueries(jnp.zeros((6, 16)), jnp.zeros((6, 16)), jnp.zeros((6, 1, 2)))
+    with pytest.raises(UserError, match=rf"into_queries of the prior mine returned {shown}, expected \(6, 16\)"):
+        fuse_into_queries({"mine": Careless()}, {"mine": None}, 0, queries)
 
 
 def test_the_hosts_own_mask_keeps_groups_of_queries_apart():

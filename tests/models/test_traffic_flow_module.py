@@ -230,6 +230,28 @@ def test_the_example_of_a_model_of_ones_own_reads_traffic():
     assert np.abs(outputs[0] - outputs[1]).max() > 1e-3
 
 
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"position": jnp.zeros((1, DIM))}, "position of the queries has shape"),
+        (
+            {"reference": jnp.zeros((1, 11, 2))},
+            rf"reference .* shape \(1, 11, 2\), expected \(Q, P, 2 or 3\) with Q = {LANES}",
+        ),
+        ({"reference": jnp.zeros((LANES, 2))}, "reference of the queries has shape"),
+        ({"reference": jnp.zeros((LANES, 11, 4))}, "reference of the queries has shape"),
+        ({"mask": jnp.ones((1, LANES), bool)}, "mask of the queries has shape"),
+    ],
+)
+def test_queries_that_do_not_fit_together_are_named(change, said):
+    """Regression: broadcasting hid that all queries had one place."""
+    spec = HostSpec(DIM, PerceptionRange(), BevGrid().range)
+    right = HostQueries(jnp.zeros((LANES, DIM)), jnp.zeros((LANES, DIM)), jnp.zeros((LANES, 11, 2)))
+    right.check(spec)
+    with pytest.raises(ValueError, match=said):
+        right._replace(**change).check(spec)
+
+
 @pytest.mark.parametrize("wrong", ["features", "position"])
 def test_queries_of_other_channels_than_the_host_says_are_named(wrong):
     spec = HostSpec(DIM, PerceptionRange(), BevGrid().range)

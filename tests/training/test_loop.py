@@ -211,6 +211,15 @@ def test_several_seeds_train_side_by_side(whole, tmp_path):
     assert len(last["score"]) == 2
 
 
+def test_numbers_of_examples_that_are_not_finite_are_named(tmp_path):
+    arrays = line_arrays()
+    arrays["x"][:] = np.nan
+    with pytest.raises(
+        UserError, match=r"step 1, .*Numbers of its examples are not finite either: x; see whether valid"
+    ):
+        run(tmp_path / "run", arrays=arrays)
+
+
 def test_a_loss_that_is_not_finite_is_named_and_the_last_good_state_kept(whole, tmp_path):
     # The term becomes infinite at the step whose batch holds the largest value of the arrays.
     limit = float(line_arrays()["x"].max()) - 1e-3

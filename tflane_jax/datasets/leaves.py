@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from tflane_jax.errors import UserError
 from tflane_jax.scene import (
     Areas,
     CameraViews,
@@ -51,6 +52,34 @@ _WITHIN: Mapping[type, Mapping[str, type]] = {
 def example_leaves(example: Example | RoadImage) -> dict[str, np.ndarray]:
     """Return the example's arrays by name in the order of the fields; what is None has no entry."""
     return dict(_named(example, ""))
+
+
+Form = Mapping[str, tuple[tuple[int, ...], np.dtype]]
+"""Shape and type of every array of an example, by name."""
+
+
+def form_of(leaves: Mapping[str, np.ndarray]) -> Form:
+    """Return the form of an example's arrays."""
+    return {name: (leaf.shape, leaf.dtype) for name, leaf in leaves.items()}
+
+
+def check_form(dataset: str, index: int, leaves: Mapping[str, np.ndarray], first: Form) -> None:
+    """Raise UserError where an example has other arrays, shapes or types than the dataset's first one.
+
+    Arrays of all examples are stacked: without this, another type would be converted, and an absent array be garbage.
+    """
+    found = form_of(leaves)
+    for name in sorted(found.keys() | first.keys()):
+        if found.get(name) != first.get(name):
+            there, other = (_told(form.get(name)) for form in (first, found))
+            raise UserError(
+                f"{dataset}: {name} is {other} in example {index} and {there} in example 0; all examples of a dataset "
+                "have the same arrays, with padding where one holds less"
+            )
+
+
+def _told(form: tuple[tuple[int, ...], np.dtype] | None) -> str:
+    return "absent" if form is None else f"{form[1]} of shape {form[0]}"
 
 
 def example_from_leaves(leaves: Mapping[str, np.ndarray]) -> Example:

@@ -15,7 +15,7 @@ import numpy as np
 
 from tflane_jax.datasets.base import Dataset
 from tflane_jax.datasets.cache import CachedDataset
-from tflane_jax.datasets.leaves import example_from_leaves, example_leaves
+from tflane_jax.datasets.leaves import Form, check_form, example_from_leaves, example_leaves, form_of
 from tflane_jax.datasets.streaming import InOrder, Streamed, StreamingConfig
 from tflane_jax.errors import UserError
 from tflane_jax.progress import progress_bar
@@ -59,10 +59,14 @@ def stream(dataset: Dataset, config: StreamingConfig, parts: Collection[str] = T
     Raises UserError if the dataset is empty, or a cache file is corrupt.
     """
     _refuse_empty(dataset)
+    select = partial(keep, parts=parts)
     if isinstance(dataset, CachedDataset):
         dataset = dataset.only(_checked(parts))
         dataset.check()
-    return Streamed(dataset, config, partial(keep, parts=parts))
+        return Streamed(dataset, config, select)
+    first = dataset.example(0)
+    _check_first(dataset, first)
+    return Streamed(dataset, config, select, form=form_of(example_leaves(select(first))))
 
 
 def load_arrays(
@@ -84,8 +88,8 @@ def load_arrays(
         The examples stacked along a new first axis.
 
     Raises:
-        UserError: the dataset is empty, or a cache file is corrupt.
-        ValueError: a name in `parts` is no field of `Example`, or examples differ in shape.
+        UserError: the dataset is empty, its examples differ in shape or type, or a cache file is corrupt.
+        ValueError: a name in `parts` is no field of `Example`.
     """
     _refuse_empty(dataset)
     wanted = None if parts is None else _checked(parts)
@@ -110,19 +114,28 @@ def _stacked(
     if workers is not None:
         examples = Streamed(dataset, workers).stream(InOrder(count), count)
     bar = progress_bar(examples, f"loading {dataset.name}", unit="example", total=count, disable=not progress)
+    first: Form = {}
     for index, example in enumerate(bar):
-        for name, leaf in example_leaves(example).items():
+        found = example_leaves(example)
+        if index == 0:
+            _check_first(dataset, example)
+            first = form_of(found)
+        check_form(dataset.name, index, found, first)
+        for name, leaf in found.items():
             if parts is not None and name.split(".")[0] not in parts:
                 continue
             if index == 0:
                 leaves[name] = np.empty((len(dataset), *leaf.shape), leaf.dtype)
-            elif leaves[name].shape[1:] != leaf.shape:
-                raise ValueError(
-                    f"{dataset.name}: {name} is {leaf.shape} in example {index} and "
-                    f"{leaves[name].shape[1:]} in example 0"
-                )
             leaves[name][index] = leaf
     return leaves
+
+
+def _check_first(dataset: Dataset, example: Example) -> None:
+    """Raise UserError where the arrays of an example do not fit each other."""
+    try:
+        example.validate()
+    except AssertionError as error:
+        raise UserError(f"{dataset.name}: in example 0, {error}") from None
 
 
 def keep(arrays: Example, parts: Collection[str]) -> Example:

@@ -22,7 +22,7 @@ import numpy as np
 
 from tflane_jax.child_processes import end_with_parent, spared_interrupts
 from tflane_jax.datasets.base import IndexedExamples
-from tflane_jax.datasets.leaves import example_leaves
+from tflane_jax.datasets.leaves import check_form, example_leaves
 from tflane_jax.errors import UserError
 from tflane_jax.progress import progress_bar
 
@@ -90,8 +90,7 @@ def fill(
 
     Raises:
         OSError: disk full, or no permission.
-        ValueError: examples differ in shape.
-        UserError: a worker died.
+        UserError: examples differ in shape or type, or a worker died.
         Exception: what the dataset raises.
     """
     count = len(dataset)
@@ -171,24 +170,14 @@ def _write_examples(job: _Job, indices: range) -> list[str]:
         files = {name: stack.enter_context(open(leaf_path(job.folder, name), "r+b")) for name in job.slots}
         for index in indices:
             leaves, scene = frame_leaves(job.dataset, index)
-            _check(job, index, leaves)
+            check_form(
+                job.dataset.name, index, leaves, {name: (slot.shape, slot.dtype) for name, slot in job.slots.items()}
+            )
             for name, leaf in leaves.items():
                 files[name].seek(job.slots[name].start + index * leaf.nbytes)
                 files[name].write(leaf.tobytes())
             scenes.append(scene)
     return scenes
-
-
-def _check(job: _Job, index: int, leaves: dict[str, np.ndarray]) -> None:
-    """Raise ValueError where an example has other shapes or types than the first one."""
-    found = {name: (leaf.shape, leaf.dtype) for name, leaf in leaves.items()}
-    expected = {name: (slot.shape, slot.dtype) for name, slot in job.slots.items()}
-    for name in sorted(found.keys() | expected.keys()):
-        if found.get(name) != expected.get(name):
-            raise ValueError(
-                f"{job.dataset.name}: {name} is {found.get(name)} in example {index} and {expected.get(name)} "
-                "in example 0; all examples of a dataset have the same shapes"
-            )
 
 
 _worker_job: _Job

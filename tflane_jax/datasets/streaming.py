@@ -16,6 +16,7 @@ import numpy as np
 
 from tflane_jax.cores import own_cores
 from tflane_jax.datasets.base import IndexedExamples
+from tflane_jax.datasets.leaves import Form, check_form, example_leaves
 from tflane_jax.errors import UserError, missing_extra
 from tflane_jax.limits import Count, CountOrZero
 
@@ -95,12 +96,14 @@ class Streamed:
         select: example -> the part of it to keep; None keeps all.
         wanted: example -> whether to use it. In place of one that is not wanted, `stream` yields another, drawn with
             the request's key. None uses all.
+        form: of what `select` keeps of the first example; None where examples are known to be alike.
     """
 
     dataset: IndexedExamples
     config: StreamingConfig = StreamingConfig()
     select: Callable[[Any], Any] | None = None
     wanted: Callable[[Any], bool] | None = None
+    form: Form | None = None
 
     def __len__(self) -> int:
         return len(self.dataset)
@@ -108,7 +111,10 @@ class Streamed:
     def example(self, index: int) -> Any:
         """Return the selected part of one example."""
         example = self.dataset.example(index)
-        return example if self.select is None else self.select(example)
+        example = example if self.select is None else self.select(example)
+        if self.form is not None:
+            check_form(self.dataset.name, index, example_leaves(example), self.form)
+        return example
 
     def requested(self, request: Request) -> Any:
         """Return the requested example, or the one drawn in its place; see `wanted`.

@@ -11,6 +11,7 @@ import optax
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from tflane_jax.errors import UserError
 from tflane_jax.matching import Assignment
 from tflane_jax.models.auxiliary import AuxiliaryOutputs
 from tflane_jax.scene import Example, Prediction
@@ -46,6 +47,24 @@ class HostLossConfig:
             UserError: the examples lack ground truth for a predicted part.
         """
         raise NotImplementedError
+
+
+def checked_loss(losses: HostLossConfig, found: Any) -> tuple[Float[Array, ""], Report]:
+    """Return what `loss` returned; raise UserError, which names its class, for anything but a scalar and scalars."""
+    what = f"{type(losses).__name__}.loss"
+    if not isinstance(found, tuple) or len(found) != 2 or not isinstance(found[1], dict):
+        raise UserError(f"{what} returned {type(found).__name__}: expected a tuple of the loss and a dict of numbers")
+    loss, report = found
+    for name, value in {"the loss": loss, **{f"the number {name!r}": value for name, value in report.items()}}.items():
+        try:
+            shape, kind = jnp.shape(value), jnp.result_type(value)
+        except TypeError:
+            raise UserError(f"{what}: {name} is {type(value).__name__}, expected a scalar array") from None
+        if shape != ():
+            raise UserError(f"{what}: {name} has shape {shape}, expected a scalar")
+        if value is loss and not jnp.issubdtype(kind, jnp.floating):
+            raise UserError(f"{what}: {name} is of type {kind}, expected a float")
+    return loss, report
 
 
 def total(terms: Terms) -> Float[Array, ""]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar, get_args
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -18,6 +18,7 @@ from tflane_jax.geometry.polylines import pad_lines
 
 # By which a confidence may miss 0 to 1, such as the sum of a softmax.
 _ROUNDING = 1e-6
+T = TypeVar("T")
 Lines = Sequence[Float[np.ndarray, "_ d"]] | Float[np.ndarray, "l n d"]
 
 
@@ -102,6 +103,13 @@ def checked_lines(lines: Lines, what: str, dims: int = 3) -> Float[np.ndarray, "
     return points
 
 
+def one_of(name: str, value: T, allowed: Any) -> T:
+    """Return an argument that is a `Literal`; raise UserError, with what is allowed, for any other value."""
+    if value not in get_args(allowed):
+        raise UserError(f"{name} is {value!r}: it must be {' or '.join(map(repr, get_args(allowed)))}")
+    return value
+
+
 def check_shape(array: np.ndarray, shape: tuple[int, ...], what: str) -> None:
     """Raise UserError if the array has another shape or holds a number that is not finite."""
     if array.shape != shape:
@@ -111,9 +119,11 @@ def check_shape(array: np.ndarray, shape: tuple[int, ...], what: str) -> None:
 
 
 def checked_edges(edges: Any, shape: tuple[int, ...], what: str) -> Bool[np.ndarray, "a b"]:
-    """Return true relations as flags; raise UserError for another shape or a number that is not finite."""
+    """Return true relations as flags; raise UserError for another shape or a number that is neither 0 nor 1."""
     edges = np.asarray(edges)
     check_shape(edges, shape, what)
+    if not np.isin(edges, (0, 1)).all():
+        raise UserError(f"{what} holds a number that is neither 0 nor 1")
     return edges.astype(bool)
 
 

@@ -210,6 +210,10 @@ class GroupedMetrics:
         self._frame_groups = frozenset(frame_groups)
         self._lane_groups = frozenset(lane_groups)
         groups = ("all", *partition.names) if groups is None else groups
+        if taken := (set(lane_groups) | set(frame_groups)) & {"all", *partition.names} or {*lane_groups} & {
+            *frame_groups
+        }:
+            raise UserError(f"two groups are called {min(taken)}: give the further one another name")
         self._metrics = {group: make() for group in (*groups, *lane_groups, *frame_groups)}
         self._empty = make()
         # Of every frame: true lanes and hits, summed over the thresholds.
@@ -255,18 +259,34 @@ class GroupedMetrics:
             members: for each of `lane_groups`, which of the true lanes belong to it.
         """
         own = (frame_group,) if isinstance(frame_group, str) else frame_group or ()
+        if unknown := set(own) - set(self._frame_groups):
+            raise UserError(
+                f"there is no group of frames {min(unknown)!r}, only {', '.join(self._frame_groups) or 'none'}"
+            )
         for group, metrics in self._metrics.items():
             lanes = hits = 0
             self._measures[group].append(group not in self._frame_groups or group in own)
             if self._measures[group][-1]:
                 part = frame
                 if group in self._lane_groups:
-                    part = frame.select((members or {})[group])
+                    part = frame.select(self._members(group, members, frame.lanes))
                 elif group != "all" and group not in own:
                     part = frame.select(self.partition.members(group, truth))
                 metrics.add(part)
                 lanes, hits = part.lanes, int(part.hits.sum())
             self._recalled[group].append((lanes, hits))
+
+    @staticmethod
+    def _members(group: str, members: Mapping[str, Any] | None, lanes: int) -> Bool[np.ndarray, " g"]:
+        """Return the members of a further group of lanes; raise UserError for anything but a bool for each lane."""
+        if members is None or group not in members:
+            raise UserError(f"members lacks {group}, one of the lane_groups")
+        found = np.asarray(members[group])
+        if found.dtype != bool or found.shape != (lanes,):
+            raise UserError(
+                f"members of {group} are {found.dtype} of shape {found.shape}, expected bool of shape ({lanes},)"
+            )
+        return found
 
     def recalled(self) -> dict[str, Int[np.ndarray, "f 2"]]:
         """Return by group, for every frame: true lanes, and hits summed over the thresholds.

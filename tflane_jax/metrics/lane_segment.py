@@ -18,6 +18,7 @@ from jaxtyping import Float, Int
 from tflane_jax.errors import UserError
 from tflane_jax.metrics.bootstrap import Weights, bootstrap_precisions, frame_numbers
 from tflane_jax.metrics.centerline_matching import LANE_THRESHOLDS
+from tflane_jax.metrics.frames import one_of
 from tflane_jax.metrics.groups import Scope
 from tflane_jax.metrics.matching import average_precision_11, pooled
 from tflane_jax.metrics.merging import by_frame, joined
@@ -46,7 +47,7 @@ class LaneSegmentMetrics:
     """
 
     def __init__(self, flavour: Flavour = "OpenLane-V2") -> None:
-        self.flavour: Flavour = flavour
+        self.flavour: Flavour = one_of("flavour", flavour, Flavour)
         self._lanes = CenterlineMetrics(("v2.1",))
         self._area_detections: list[tuple[np.ndarray, ...]] = []  # of every frame: scores, categories, hits
         self._frame_areas: list[np.ndarray] = []  # of every frame: true areas by category

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Int
 
 from tflane_jax.errors import UserError
 from tflane_jax.metrics.bootstrap import Weights, bootstrap_precisions, frame_numbers
+from tflane_jax.metrics.frames import one_of
 from tflane_jax.metrics.groups import Scope
 from tflane_jax.metrics.map_matching import (
     CLASSES,
@@ -49,9 +50,9 @@ class VectorMapMetrics:
     """
 
     def __init__(self, sampling: Sampling = "maptr", measure: Measure = "chamfer", dims: Dims = 2) -> None:
-        self.sampling: Sampling = sampling
-        self.measure: Measure = measure
-        self.dims: Dims = dims
+        self.sampling: Sampling = one_of("sampling", sampling, Sampling)
+        self.measure: Measure = one_of("measure", measure, Measure)
+        self.dims: Dims = one_of("dims", dims, Dims)
         self._detections: list[tuple[np.ndarray, ...]] = []  # of every frame: scores, classes, hits
         self._frame_truths: list[np.ndarray] = []  # of every frame: true lines by class
 

@@ -89,11 +89,22 @@ class HostQueries(NamedTuple):
     groups: tuple[int, ...] = ()
 
     def check(self, host: HostSpec) -> None:
-        """Raise ValueError for queries, or position encodings, of other channels than the host's."""
+        """Raise ValueError for queries of other channels than the host's, or arrays that do not fit together."""
         for name, found in (("features", self.features), ("position", self.position)):
             if found.ndim != 2 or found.shape[1] != host.dim:
                 shape, wanted = tuple(found.shape), f"(Q, HostSpec.dim) = (Q, {host.dim})"
                 raise ValueError(f"{name} of the queries have shape {shape}, expected {wanted}")
+        count = len(self.features)
+        fits = {
+            f"position: (Q, D) with Q = {count}": len(self.position) == count,
+            f"reference: (Q, P, 2 or 3) with Q = {count}": self.reference.ndim == 3
+            and self.reference.shape[0] == count
+            and self.reference.shape[2] in (2, 3),
+            f"mask: (Q, Q) with Q = {count}": self.mask is None or self.mask.shape == (count, count),
+        }
+        if wrong := [what for what, right in fits.items() if not right]:
+            name, _, wanted = wrong[0].partition(": ")
+            raise ValueError(f"{name} of the queries has shape {tuple(getattr(self, name).shape)}, expected {wanted}")
 
 
 class Prior:

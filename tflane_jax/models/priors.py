@@ -16,6 +16,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
+from tflane_jax.errors import UserError
 from tflane_jax.geometry import BevGrid
 from tflane_jax.models.marker_fusion import MarkerFusionConfig
 from tflane_jax.models.prior import BevCells, BevHook, HostQueries, HostSpec, Prior, PriorConfig
@@ -107,7 +108,8 @@ def bev_hook(priors: Mapping[str, Prior], tokens: ByPrior, host: HostSpec) -> Be
         columns, rows = (len(np.unique(places[:, axis])) for axis in (0, 1))
         grid = BevGrid(host.bev_range, rows, columns)
         for name, prior in fusing.items():
-            bev = prior.into_bev(tokens[name], layer, BevCells(bev, position, centers, grid))
+            fused = prior.into_bev(tokens[name], layer, BevCells(bev, position, centers, grid))
+            bev = _alike(f"into_bev of the prior {name}", fused, bev)
         return bev
 
     return fuse
@@ -118,5 +120,14 @@ def fuse_into_queries(
 ) -> Float[Array, "q d"]:
     """Return the queries before a decoder layer with every prior fused in."""
     for name, prior in priors.items():
-        queries = queries._replace(features=prior.into_queries(tokens[name], layer, queries))
+        fused = prior.into_queries(tokens[name], layer, queries)
+        queries = queries._replace(features=_alike(f"into_queries of the prior {name}", fused, queries.features))
     return queries.features
+
+
+def _alike(what: str, found: Any, features: Array) -> Array:
+    """Return what a prior made of features; raise UserError for another shape, which broadcasting would hide."""
+    if getattr(found, "shape", None) != features.shape:
+        shown = f"an array of shape {found.shape}" if hasattr(found, "shape") else type(found).__name__
+        raise UserError(f"{what} returned {shown}, expected {features.shape}, the shape of the features it was given")
+    return found

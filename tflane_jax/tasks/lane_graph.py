@@ -30,7 +30,7 @@ from tflane_jax.geometry import PerceptionRange
 from tflane_jax.layers.batch_norm import BATCH_AXIS, STATISTICS
 from tflane_jax.layers.bev_attention import LOST
 from tflane_jax.limits import Count, SettingError
-from tflane_jax.losses.common import HostLossConfig
+from tflane_jax.losses.common import HostLossConfig, checked_loss
 from tflane_jax.losses.toponet import TopoNetLossConfig
 from tflane_jax.models.auxiliary import AUXILIARY, auxiliary_outputs
 from tflane_jax.models.evidence_encoder import EvidenceEncoderConfig
@@ -150,7 +150,7 @@ class LaneGraphTask(Task[Example, Example | Streamed, LaneGraphSource, HostMemor
         (outputs, auxiliary, lost), updated = train(batch, observations, keys)
         if through_clips:
             outputs, auxiliary, batch = _frames((outputs, auxiliary, batch))
-        loss, report = self.losses.loss(outputs, auxiliary, batch, self.model)
+        loss, report = checked_loss(self.losses, self.losses.loss(outputs, auxiliary, batch, self.model))
         return loss, report | {name: count.mean() for name, count in lost.items()} | updated
 
     def _observations(self, example: Example) -> ByPrior:

@@ -297,7 +297,9 @@ def train(
                 states, values = update_all(update, states, batch)
                 if not values["finite"].all():
                     save({})
-                    raise AgreedError(not_finite(values, step, config.seeds, checkpoints.path(step)))
+                    raise AgreedError(
+                        not_finite(values, step, config.seeds, checkpoints.path(step), batch if count() == 1 else ())
+                    )
                 step += 1
                 window.add({name: value for name, value in values.items() if name != "finite"})
                 asked = time.perf_counter()

@@ -5,7 +5,9 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
+import jax
 import numpy as np
 
 from tflane_jax.errors import UserError
@@ -18,17 +20,39 @@ NO_BEST = (
 )
 
 
-def not_finite(values: dict[str, np.ndarray], step: int, seeds: tuple[int, ...], kept: Path) -> str:
-    """Return a message with the step, the seed and everything that is not finite: loss terms, loss, gradient."""
+def not_finite(
+    values: dict[str, np.ndarray], step: int, seeds: tuple[int, ...], kept: Path, batches: Sequence[Any] = ()
+) -> str:
+    """Return a message with the step, the seed and everything that is not finite: loss terms, loss, gradient.
+
+    Args:
+        values: of the update.
+        step: before it.
+        seeds: of the run.
+        kept: folder of the last good state.
+        batches: examples of each seed, if this process has them all; their padding may hold such numbers too.
+    """
     bad = int(np.argmin(np.atleast_1d(values["finite"])))
     numbers = {name: float(np.atleast_1d(value)[bad]) for name, value in values.items()}
     terms = [name for name, value in sorted(numbers.items(), reverse=True) if not np.isfinite(value)]
     what = ", ".join(f"{name} = {numbers[name]}" for name in terms)
+    fields = _not_finite_in(batches[bad]) if batches else ""
+    data = f"Numbers of its examples are not finite either: {fields}; see whether valid ones are. " if fields else ""
     return (
-        f"step {step + 1}, seed {seeds[bad]}: {what} is not finite. The last good state (step {step}) is kept in "
+        f"step {step + 1}, seed {seeds[bad]}: {what} is not finite. {data}The last good state (step {step}) is kept in "
         f"{kept}. Lower optim.lr or optim.clip_norm and train into another folder, from the start or from this run's "
         "averaged parameters (training.init_from)"
     )
+
+
+def _not_finite_in(batch: Any) -> str:
+    """Return the names of the arrays of a batch that hold a number that is not finite."""
+    found = [
+        jax.tree_util.keystr(path, simple=True, separator=".")
+        for path, leaf in jax.tree_util.tree_leaves_with_path(batch)
+        if np.issubdtype(leaf.dtype, np.floating) and not np.isfinite(np.asarray(leaf)).all()
+    ]
+    return ", ".join(found)
 
 
 def due_notices(untold: dict[str, str], record: Record) -> list[str]:

@@ -101,8 +101,8 @@ def test_outputs_that_cannot_be_written_are_named_before_anything_is_read(folder
         (tmp_path / "predictions.json" / "score", "predictions.json is no folder"),
         (tmp_path / "taken", "taken.json: it is a folder"),
         (Path(""), "names no file"),
-        (tmp_path / "predictions", "would write over .*predictions.json, which is read"),
-        (tmp_path / "truth", "would write over .*truth.json, which is read"),
+        (tmp_path / "predictions", "would write over .*predictions.json, a file that is read"),
+        (tmp_path / "truth", "would write over .*truth.json, a file that is read"),
     ):
         with pytest.raises(UserError, match=message):
             run([protocol, predictions, truth], folder, out=out)

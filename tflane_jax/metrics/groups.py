@@ -210,10 +210,9 @@ class GroupedMetrics:
         self._frame_groups = frozenset(frame_groups)
         self._lane_groups = frozenset(lane_groups)
         groups = ("all", *partition.names) if groups is None else groups
-        if taken := (set(lane_groups) | set(frame_groups)) & {"all", *partition.names} or {*lane_groups} & {
-            *frame_groups
-        }:
-            raise UserError(f"two groups are called {min(taken)}: give the further one another name")
+        names = ["all", *partition.names, *lane_groups, *frame_groups]
+        if twice := {name for name in names if names.count(name) > 1}:
+            raise UserError(f"two groups are called {min(twice)}: give the further one another name")
         self._metrics = {group: make() for group in (*groups, *lane_groups, *frame_groups)}
         self._empty = make()
         # Of every frame: true lanes and hits, summed over the thresholds.

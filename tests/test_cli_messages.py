@@ -51,7 +51,9 @@ def test_an_array_that_does_not_fit_is_one_line(monkeypatch, capsys):
 @pytest.mark.skipif(os.name != "posix", reason="signal masks")
 def test_processes_started_so_see_no_interrupt_and_this_one_does():
     """Ctrl-C reaches the whole process group, also children that still import their modules."""
-    wait = [sys.executable, "-c", "import os; os.kill(os.getpid(), 2); print('goes on')"]
+    # A shell starts what runs in the background with the signal ignored, and children inherit that too.
+    code = "import os, signal; signal.signal(2, signal.SIG_DFL); os.kill(os.getpid(), 2); print('goes on')"
+    wait = [sys.executable, "-c", code]
     with spared_interrupts():
         spared = subprocess.run(wait, capture_output=True, text=True, check=False)
         with ProcessPoolExecutor(2, multiprocessing.get_context("spawn")) as pool:
@@ -59,8 +61,12 @@ def test_processes_started_so_see_no_interrupt_and_this_one_does():
     assert (spared.returncode, spared.stdout) == (0, "goes on\n")
     assert all(signal.SIGINT in mask.result() for mask in masks)
     assert subprocess.run(wait, capture_output=True, check=False).returncode != 0
-    with pytest.raises(KeyboardInterrupt):
-        signal.raise_signal(signal.SIGINT)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no /dev/full")

@@ -48,7 +48,7 @@ def mixed_hosts(rows: Sequence[TableRow], trained: Mapping[str, Sequence[Job]]) 
         if mixed := sorted(seed for seed, origins in by_seed.items() if len(origins) > 1):
             seeds = f"seed{'s' if len(mixed) > 1 else ''} {', '.join(map(str, mixed))}"
             sentences.append(
-                f"Rows of {seeds} start from different trainings of {host}: differences hold those of the hosts, too."
+                f"Rows of {seeds} do not all start from one known training of {host}: they may differ by their hosts."
             )
     return sentences
 

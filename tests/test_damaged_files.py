@@ -24,9 +24,9 @@ from tflane_jax.runs import open_run, resumable_config
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.training import array_files, checkpoint, provenance, run_folder
 from tflane_jax.training.checkpoint import Checkpoints
-from tflane_jax.training.loop import WRONG_PROGRESS, _carried
 from tflane_jax.training.manifest import Manifest
 from tflane_jax.training.records import RecordWriter, read_records
+from tflane_jax.training.resumption import Latest, carried
 from tflane_jax.training.schedule import OptimConfig, make_optimizer
 from tflane_jax.training.state import init_states
 
@@ -184,10 +184,11 @@ def test_a_score_that_no_number_can_hold_is_named(run):
         {"cycles": [{"x": 1}]},
     ],
 )
-def test_wrong_progress_is_an_error_that_the_loop_names(change):
-    assert _carried(PROGRESS, [])[2] == 1.0
-    with pytest.raises(WRONG_PROGRESS):
-        _carried(PROGRESS | change, [])
+def test_wrong_progress_names_the_checkpoint(change, tmp_path):
+    checkpoints = Checkpoints(tmp_path)
+    assert carried(checkpoints, Latest(step=3, progress=PROGRESS), []).seconds == 1.0
+    with pytest.raises(UserError, match=r"step_00000003 is damaged .*progress is not what was written"):
+        carried(checkpoints, Latest(step=3, progress=PROGRESS | change), [])
 
 
 def test_a_damaged_run_ends_the_command_with_a_message(run, capsys):

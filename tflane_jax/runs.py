@@ -29,6 +29,7 @@ from tflane_jax.files.atomic import write_json, write_text
 from tflane_jax.limits import check_settings
 from tflane_jax.migrations import migrate
 from tflane_jax.models.parameters import Params
+from tflane_jax.own_modules import own_code
 from tflane_jax.processes import agreed, from_first, is_first
 from tflane_jax.run_checks import agree_on_settings, check_model, check_origin_model, check_rate_factors, check_run
 from tflane_jax.startup import showing, stage
@@ -135,6 +136,7 @@ def _train(config: RunConfig, folder: Path, *, start: Start, progress: bool, dra
         draw=_drawing(config, drawn),
         frozen=task.frozen,
         content=content,
+        own_code=own_code(config),
         progress=progress,
     )
 

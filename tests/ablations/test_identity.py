@@ -222,6 +222,24 @@ def test_scores_belong_to_the_files_of_maps_and_of_own_classes(tiny, out, tmp_pa
     assert len(loaded) == 4
 
 
+def test_own_classes_that_were_edited_since_are_told(tiny, tmp_path, capsys):
+    """Regression: scores of the code before an edit were shown without a word."""
+    config, out = tmp_path / "edited.py", tmp_path / "out"
+    text = tiny.read_text().replace(
+        "LaneGraphTask(TopoNetConfig(", "LaneGraphTask(losses=EditedLoss(), model=TopoNetConfig("
+    )
+    text = text.replace("replace(get_config(), task=LaneGraphTask())", "get_config()")
+    config.write_text(text + "\n\n" + OWN_LOSS.format(0.1).replace("OwnLoss", "EditedLoss"))
+    assert again(config, out) == again(config, out) == 0
+    assert "were edited" not in capsys.readouterr().err
+    before = losses(out / "base" / "seed_0")
+    config.write_text(config.read_text() + "# edited\n")
+    assert again(config, out) == 0
+    told = f"own classes were edited since they trained {out / 'base' / 'seed_0'}: delete these folders"
+    assert told in capsys.readouterr().err
+    assert losses(out / "base" / "seed_0") == before
+
+
 def test_a_run_that_ended_before_its_last_checkpoint_is_not_complete(tiny, out):
     """Its records already reach the last step, because they are written before the last evaluation."""
     run = out / "base" / "seed_0"

@@ -221,6 +221,8 @@ def test_other_code_and_packages_are_told_at_a_resume(tmp_path, capsys):
     assert ("commit 012345678 with uncommitted changes -> " in told) == (provenance()["git"] is not None)
     run(folder, start="resume")
     assert "other code" not in capsys.readouterr().err
+    run(folder, start="resume", own_code="feedbeef1234")
+    assert "other code before (own classes none -> feedbeef1)" in capsys.readouterr().err
 
 
 def test_a_checkpoint_is_identified_by_its_content(tmp_path):

@@ -15,9 +15,9 @@ from tflane_jax.ablations.declaration import Declaration, check, declare
 from tflane_jax.ablations.effects import judged_claims
 from tflane_jax.ablations.findings import save_effects
 from tflane_jax.ablations.finished_runs import (
+    code_notices,
     draw_models,
     first_models,
-    mixed_code,
     save_plan,
     summary_of,
     train_and_evaluate,
@@ -30,7 +30,7 @@ from tflane_jax.ablations.workers import worker_threads
 from tflane_jax.config import RunConfig
 from tflane_jax.datasets.sources import source_of
 from tflane_jax.errors import UserError
-from tflane_jax.startup import write
+from tflane_jax.training.notices import print_notices
 
 
 def compare(
@@ -85,8 +85,7 @@ def compare(
     written = [save_plan(plan, failures, results, out)]
     if not results.scores:
         raise UserError(summary_of(failures, len(every)))
-    if (notice := mixed_code(trained)) is not None:
-        write(notice)
+    print_notices(code_notices(trained))
     first, models = next(iter(configs.values())), first_models(trained, results)
     remarks = {name: model.task.remarks(model.params) for name, model in models.items()}
     pair = list(configs)[:2] if declaration is None else [next(iter(configs)), declaration.claims[0].treatment]

@@ -15,9 +15,11 @@ from tflane_jax.ablations.workers import noted, train_all
 from tflane_jax.config import RunConfig
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import write_json
+from tflane_jax.own_modules import own_code
 from tflane_jax.progress import progress_bar
 from tflane_jax.runs import load_test_data, open_run
 from tflane_jax.tasks import Model
+from tflane_jax.training.provenance import read_provenance
 
 
 def train_and_evaluate(
@@ -127,13 +129,26 @@ def commits(jobs: Sequence[Job]) -> tuple[str, ...]:
     return tuple(sorted({commit for job in jobs for commit in facts(job).commits}))
 
 
-def mixed_code(trained: Mapping[str, Sequence[Job]]) -> str | None:
-    """Return a notice where runs were trained by different commits: a difference of theirs may be the code's."""
-    found = {name: commits(jobs) for name, jobs in trained.items()}
-    if len({commit for each in found.values() for commit in each}) < 2:
-        return None
-    listed = "; ".join(f"{name}: {', '.join(each)}" for name, each in found.items() if each)
-    return f"the runs were trained by different states of the code ({listed}): differences of scores may be theirs"
+def code_notices(trained: Mapping[str, Sequence[Job]]) -> list[str]:
+    """Return notices about the code that trained runs: several commits, and own classes that were edited since."""
+    notices, found = [], {name: commits(jobs) for name, jobs in trained.items()}
+    if len({commit for each in found.values() for commit in each}) > 1:
+        listed = "; ".join(f"{name}: {', '.join(each)}" for name, each in found.items() if each)
+        notices.append(
+            f"the runs were trained by different states of the code ({listed}): differences of scores may be theirs"
+        )
+    if edited := [str(job.folder) for jobs in trained.values() for job in jobs if _was_edited(job)]:
+        more = f" and {len(edited) - 1} more" if len(edited) > 1 else ""
+        notices.append(
+            f"own classes were edited since they trained {edited[0]}{more}: delete these folders to train them anew"
+        )
+    return notices
+
+
+def _was_edited(job: Job) -> bool:
+    """Return whether a run's own classes have other code than when it was trained, as far as that was recorded."""
+    now = own_code(job.config)
+    return job.recorded is None and any(start.get("own_code", now) != now for start in read_provenance(job.folder))
 
 
 def summary_of(failures: Sequence[Failure], count: int) -> str:

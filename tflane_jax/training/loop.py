@@ -33,6 +33,7 @@ from tflane_jax.training.manifest import Manifest
 from tflane_jax.training.notices import NO_BEST, due_notices, not_finite, only_told, print_notices
 from tflane_jax.training.records import Record, RecordWriter, Unwritten, Window, by_name, read_records, seed_record
 from tflane_jax.training.restarts import adapt
+from tflane_jax.training.resumption import carried, latest
 from tflane_jax.training.run_folder import (
     CurrentForm,
     Start,
@@ -53,9 +54,6 @@ Evaluate = Callable[[Params], dict[str, float]]
 """Averaged parameters of one seed -> numbers by name."""
 Draw = Callable[[Path, int, Params, list[Record]], None]
 """(run folder, step, averaged parameters of the first seed, all records) -> pictures in the run folder."""
-
-WRONG_PROGRESS = (KeyError, TypeError, ValueError, AttributeError, OverflowError)
-"""What a checkpoint's entry "progress" raises that is not what was written."""
 
 
 @dataclass(frozen=True)
@@ -139,6 +137,7 @@ def train(
     draw: Draw | None = None,
     frozen: Sequence[str] = (),
     content: str = "",
+    own_code: str = "",
     progress: bool = True,
 ) -> TrainingResult:
     """Train a task and leave everything about the run in `folder`.
@@ -157,6 +156,7 @@ def train(
         evaluate, draw: called at every evaluation.
         frozen: paths of modules that `init_from` must have, see `starting_params`.
         content: hash of the files of the examples, which a resumed run must find unchanged; "" for none.
+        own_code: hash of the user's own code in the run, recorded with its start; "" for none.
         progress: show a bar with rate and time left.
 
     Raises:
@@ -196,20 +196,17 @@ def train(
             example = example if prepare is None else prepare(example, (config.seeds[0], 0, 0))
             states = init_states(task, optimizer, config.seeds, example)
         window, metrics, times = Window(), {}, StepTime()
-        memories, started_from = [Memory() for _ in config.seeds], {}
+        memories, started_from = [Memory() for _ in config.seeds], {"own_code": own_code}
         data, due = {"examples": example_count(arrays), "content": content}, False
         agree_on_data(data)
-        if start == "resume" and (latest := from_first(lambda: _latest(checkpoints))) is not None:
+        if start == "resume" and (saved := from_first(lambda: latest(checkpoints))) is not None:
             whole = of_all_seeds(states)
-            with stage(f"restoring step {latest['step']}"):
-                restored = arrays_from_first(lambda: checkpoints.restore(latest["step"], whole), whole)
-            states = per_seed(restored, config.seeds)
-            try:
-                window, metrics, times.seconds, memories = _carried(latest["progress"], memories)
-                before, due = data | latest["progress"], bool(latest["progress"].get("due"))
-            except WRONG_PROGRESS as error:
-                raise checkpoints.damaged_progress(latest["step"], error) from error
-            check_same_data(folder, before, data)
+            with stage(f"restoring step {saved['step']}"):
+                restored = arrays_from_first(lambda: checkpoints.restore(saved["step"], whole), whole)
+            states, before = per_seed(restored, config.seeds), carried(checkpoints, saved, memories)
+            window, metrics, times.seconds = before.window, before.metrics, before.seconds
+            memories, due = before.memories, before.due
+            check_same_data(folder, data | saved["progress"], data)
         elif (origin := config.init_from) is not None:
             fresh = states
             with stage(f"reading {origin}"):
@@ -218,7 +215,7 @@ def train(
                     [state.params for state in fresh],
                 )
             states = [state_of(params, optimizer, s.key) for params, s in zip(given, states, strict=True)]
-            started_from = {"init_from": from_first(lambda: origins(origin, config.seeds, read=True))}
+            started_from["init_from"] = from_first(lambda: origins(origin, config.seeds, read=True))
         place = partial(placed, mesh=mesh, shard=config.shard_state)
         states = [place(state) for state in states]
         first = step = int(states[0].step)
@@ -333,18 +330,3 @@ def train(
         rate = (step - first) / times.own if times.own else 0.0
         unfinished = stopped if step < config.steps else None
         return TrainingResult(step, metrics, compile_seconds, rate, asked_by=stopped, stopped_by=unfinished)
-
-
-def _latest(checkpoints: Checkpoints) -> dict[str, Any] | None:
-    """Return step and progress of the latest checkpoint; None if there is none."""
-    # All are read, because the next save looks for the best one: a damaged one would end the run there.
-    found = [{"step": step, "progress": checkpoints.manifest(step).progress} for step in checkpoints.steps()]
-    return found[-1] if found else None
-
-
-def _carried(saved: dict[str, Any], fresh: list[Memory]) -> tuple[Window, dict[str, float], float, list[Memory]]:
-    """Return window, metrics, seconds and the memories of seeds from a checkpoint's progress."""
-    sums = {name: list(map(float, values)) for name, values in saved["window"]["sums"].items()}
-    window = Window(int(saved["window"]["steps"]), sums)
-    metrics = {name: float(value) for name, value in saved["metrics"].items()}
-    return window, metrics, float(saved["seconds"]), [Memory(**one) for one in saved.get("cycles", [])] or fresh

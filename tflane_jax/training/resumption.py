@@ -1,0 +1,69 @@
+"""What a resumed run goes on with beside its state: the entry "progress" of its latest checkpoint."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, TypedDict
+
+from tflane_jax.training.adaptive import Memory
+from tflane_jax.training.checkpoint import Checkpoints
+from tflane_jax.training.records import Window
+
+# What the entry raises where it is not what was written.
+_WRONG = (KeyError, TypeError, ValueError, AttributeError, OverflowError)
+
+
+class Latest(TypedDict):
+    """Step of the latest checkpoint and its progress, both plain JSON."""
+
+    step: int
+    progress: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Carried:
+    """Progress as the loop takes it up.
+
+    Attributes:
+        window: sums since the last record.
+        metrics: of the last evaluation.
+        seconds: of all steps so far.
+        memories: of the adaptive schedule, one a seed.
+        due: whether the evaluation of this step is still to be made.
+    """
+
+    window: Window
+    metrics: dict[str, float]
+    seconds: float
+    memories: list[Memory]
+    due: bool
+
+
+def latest(checkpoints: Checkpoints) -> Latest | None:
+    """Return the latest checkpoint, None if there is none; raises UserError if any is damaged."""
+    # All are read, because the next save looks for the best one: a damaged one would end the run there.
+    found = [Latest(step=step, progress=checkpoints.manifest(step).progress) for step in checkpoints.steps()]
+    return found[-1] if found else None
+
+
+def carried(checkpoints: Checkpoints, saved: Latest, fresh: Sequence[Memory]) -> Carried:
+    """Return what to go on with; raises UserError if it is not what was written.
+
+    Args:
+        checkpoints: of the run, to name the damaged one.
+        saved: the latest of them.
+        fresh: memories for a run that had no adaptive schedule so far.
+    """
+    progress = saved["progress"]
+    try:
+        sums = {name: list(map(float, values)) for name, values in progress["window"]["sums"].items()}
+        return Carried(
+            window=Window(int(progress["window"]["steps"]), sums),
+            metrics={name: float(value) for name, value in progress["metrics"].items()},
+            seconds=float(progress["seconds"]),
+            memories=[Memory(**one) for one in progress.get("cycles", [])] or list(fresh),
+            due=bool(progress.get("due")),
+        )
+    except _WRONG as error:
+        raise checkpoints.damaged_progress(saved["step"], error) from error

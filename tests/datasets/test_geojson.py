@@ -196,3 +196,9 @@ def test_a_bad_file_is_named(content, message, tmp_path):
     with pytest.raises(UserError, match=message) as raised:
         read_geojson(path)
     assert str(path) in str(raised.value)
+
+
+@pytest.mark.parametrize("pose", [(90.1, 0.0), (0.0, 180.1), (float("nan"), 0.0), (0.0, 0.0, float("nan"))])
+def test_a_pose_that_is_not_on_earth_is_refused(pose):
+    with pytest.raises(UserError, match="is no pose on Earth"):
+        Origin(*pose)

@@ -221,3 +221,22 @@ def test_means_are_the_scores():
     for name, parts in found.items():
         assert parts.shape == (6, 2)
         assert parts[:, 0].sum() / parts[:, 1].sum() == pytest.approx(expected[name])
+
+
+@pytest.mark.parametrize(
+    ("weights", "wrong"),
+    [
+        (np.ones(6, int), r"shape \(6,\), expected \(samples, 6\)"),
+        (np.ones((2, 5), int), r"shape \(2, 5\), expected \(samples, 6\)"),
+        (np.ones((2, 6)), "give integers of 0 and more"),
+        (np.full((2, 6), -1), "give integers of 0 and more"),
+        (np.full((2, 6), np.nan), "give integers of 0 and more"),
+    ],
+)
+def test_weights_that_count_no_frames_are_refused(weights, wrong):
+    metrics = GroupedMetrics(CenterlineMetrics, **GROUPS)
+    for number in range(6):
+        update_groups(metrics, number, centerlines)
+    for function in (metrics.bootstrap, lambda weights: bootstrap_mean(np.ones((6, 2)), weights)):
+        with pytest.raises(UserError, match=wrong):
+            function(weights)

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from tflane_jax.errors import UserError
 from tflane_jax.metrics import MapDetections, MapTruth
 from tflane_jax.metrics.consistency import MapConsistency
 from tflane_jax.metrics.map_matching import MAP_THRESHOLDS, match_map
@@ -85,3 +86,14 @@ def test_centerlines_take_no_part():
         matched = match_map(found, MapTruth([line(0)], np.array([kind])))
         metrics.add(matched, np.array([identity]), np.array([0]))
     assert metrics.compute()["C-AP_divider"] == 1.0
+
+
+def test_numbers_of_lines_may_be_lists_and_must_be_complete():
+    found, truth = MapDetections([line(0)], np.array([0]), np.array([0.9])), MapTruth([line(0)], np.array([0]))
+    metrics = MapConsistency()
+    metrics.add(match_map(found, truth), [3], [0])
+    assert metrics.compute()["C-AP_divider"] == 1.0
+    with pytest.raises(UserError, match=r"identities of detections has shape \(0,\), expected \(1,\)"):
+        metrics.add(match_map(found, truth), [], [0])
+    with pytest.raises(UserError, match=r"numbers of true lines has shape \(2,\), expected \(1,\)"):
+        metrics.add(match_map(found, truth), [3], [0, 1])

@@ -73,11 +73,19 @@ class Origin:
     Attributes:
         latitude, longitude: WGS84, degrees.
         heading: degrees clockwise from north, as GNSS receivers report it.
+
+    Raises UserError for a place that is not on Earth, and for a heading that is no number.
     """
 
     latitude: float
     longitude: float
     heading: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not (abs(self.latitude) <= 90.0 and abs(self.longitude) <= 180.0 and math.isfinite(self.heading)):
+            raise UserError(
+                f"{self} is no pose on Earth: give latitude (-90 to 90), longitude (-180 to 180) and heading in degrees"
+            )
 
 
 @dataclass(frozen=True)

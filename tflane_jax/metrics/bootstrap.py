@@ -8,10 +8,12 @@ repeated as often as its weights say, up to the order of equal scores, which the
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int, Shaped
 
+from tflane_jax.errors import UserError
 from tflane_jax.metrics.matching import descending
 
 # Numbers of an array of samples that are in memory at a time.
@@ -26,8 +28,21 @@ def frame_numbers(detections: Sequence[tuple[np.ndarray, ...]]) -> Int[np.ndarra
     return np.repeat(np.arange(len(detections)), [len(scores) for scores, *_ in detections])
 
 
+def checked_weights(weights: Any, frames: int) -> Weights:
+    """Return the weights of samples; raise UserError unless they are counts, one of each frame in each sample."""
+    weights = np.asarray(weights)
+    if weights.ndim != 2 or weights.shape[1] != frames:
+        raise UserError(
+            f"weights of samples have shape {weights.shape}, expected (samples, {frames}): one for each frame"
+        )
+    if not np.issubdtype(weights.dtype, np.integer) or (weights < 0).any():
+        raise UserError("weights of samples are how often each counts a frame: give integers of 0 and more")
+    return weights
+
+
 def bootstrap_mean(parts: Float[np.ndarray, "f 2"], weights: Weights) -> Float[np.ndarray, " b"]:
     """Return the ratio of two sums over frames in each sample; 0 where there is nothing to count."""
+    weights = checked_weights(weights, len(parts))
     total, count = weights @ parts[:, 0], weights @ parts[:, 1]
     return total / np.where(count, count, 1.0)
 
@@ -48,7 +63,7 @@ def bootstrap_precisions(
         truths: number of true elements of each frame.
         weights: of the frames in each sample.
     """
-    order = descending(scores)
+    weights, order = checked_weights(weights, len(truths)), descending(scores)
     hits, frame = hits[:, order].astype(bool), frame[order]
     true = weights @ truths
     nothing = (true == 0) & (weights @ np.bincount(frame, minlength=len(truths)) == 0)

@@ -21,6 +21,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from tflane_jax.metrics.bootstrap import Weights, bootstrap_precisions, frame_numbers
+from tflane_jax.metrics.frames import check_shape
 from tflane_jax.metrics.map_matching import CLASSES, MAP_THRESHOLDS, MatchedMap
 from tflane_jax.metrics.matching import average_precision_area, pooled
 from tflane_jax.metrics.merging import by_frame
@@ -53,7 +54,12 @@ class MapConsistency:
             frame: matching results of the confident detections.
             identities: of these detections.
             lines: numbers of the true lines, the same in every frame of the scene; those of centerlines are not read.
+
+        Raises UserError if a detection or a true line lacks its number.
         """
+        identities, lines = np.asarray(identities), np.asarray(lines)
+        check_shape(identities, frame.scores.shape, "identities of detections")
+        check_shape(lines, (frame.lanes,), "numbers of true lines")
         measured = frame.classes < len(CLASSES)
         frame, identities = frame.detections(measured), identities[measured]
         consistent = np.zeros(frame.hits.shape, bool)

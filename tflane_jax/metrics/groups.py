@@ -24,7 +24,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from tflane_jax.errors import UserError
-from tflane_jax.metrics.bootstrap import Weights
+from tflane_jax.metrics.bootstrap import Weights, checked_weights
 from tflane_jax.metrics.frames import Lines, check_shape
 from tflane_jax.metrics.merging import joined
 
@@ -324,12 +324,13 @@ class GroupedMetrics:
     def bootstrap(self, weights: Weights) -> dict[str, dict[str, Float[np.ndarray, " b"]]]:
         """Return by group the scores that rank detections, in samples that count the frames as often as `weights` says.
 
-        The samples are exact, see `metrics.bootstrap`.
+        The samples are exact, see `metrics.bootstrap`. Raises UserError for weights of another shape or kind.
         """
-        return {
-            group: metrics.bootstrap(weights[:, np.array(self._measures[group], bool)], self._scope(group))
-            for group, metrics in self._metrics.items()
-        }
+        found = {}
+        for group, metrics in self._metrics.items():
+            measured = np.array(self._measures[group], bool)
+            found[group] = metrics.bootstrap(checked_weights(weights, len(measured))[:, measured], self._scope(group))
+        return found
 
     def _scope(self, group: str) -> Scope:
         if group == "all":

@@ -176,7 +176,7 @@ class BrokenDataset(FakeDataset):
 
     def example(self, index: int) -> Example:
         if index == 2:
-            raise RuntimeError("example 2 is broken")
+            raise RuntimeError("broken")
         return super().example(index)
 
 

@@ -200,3 +200,10 @@ def test_the_scores_that_an_evaluation_gives_are_known_before(config, tmp_path):
     grouped = {name for name in of_lanes if name.startswith(LANE_GROUPS)}
     assert grouped
     assert paper.task.score_names(paper.data, paper.evaluation) == (of_lanes | more) - grouped
+
+
+def test_parameters_that_are_not_finite_are_not_saved(tmp_path):
+    params = {"scale": jnp.ones(3), "shift": {"kernel": jnp.array([1.0, jnp.nan])}}
+    with pytest.raises(UserError, match="parameter shift/kernel holds a number that is not finite"):
+        save_weights(RunConfig(), params, tmp_path / "run")
+    assert not (tmp_path / "run").exists()

@@ -269,8 +269,12 @@ def save_weights(config: RunConfig, params: Params, folder: Path, *, part: str |
 
     With `part`, the path of a module, they are that module's alone, and the folder is one to start training from.
 
-    Raises UserError if the folder is not empty.
+    Raises UserError if the folder is not empty, or a parameter is not finite.
     """
+    for path, leaf in jax.tree_util.tree_leaves_with_path(params):
+        if not np.isfinite(leaf).all():
+            name = jax.tree_util.keystr(path, simple=True, separator="/")
+            raise UserError(f"parameter {name} holds a number that is not finite: no model can be used with that")
     config = replace(config, training=replace(config.training, seeds=(0,)))
     optimizer = make_optimizer(scaled_to_batch(config.optim, config.training.batch_size), config.training.steps)
     state = state_of(params, optimizer, jax.random.key(0))

@@ -125,7 +125,7 @@ def test_warnings_of_workers_are_those_of_the_build(tmp_path, monkeypatch, capfd
 @pytest.mark.parametrize("workers", with_slow([1, 2], quick=[1]))
 def test_a_failed_build_leaves_nothing(tmp_path, monkeypatch, workers):
     monkeypatch.setattr(parallel, "BLOCK", 1)
-    with pytest.raises(RuntimeError, match="example 2 is broken"):
+    with pytest.raises(RuntimeError, match=r"broken\n\(raised by example 2 of fake\)"):
         build(tmp_path, BrokenDataset(FakeConfig(size=4)), workers=workers)
     assert entries(tmp_path) == []
 

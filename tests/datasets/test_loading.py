@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import pytest
 
-from tests.fakes import FakeConfig, FakeDataset, UnevenDataset
+from tests.fakes import BrokenDataset, FakeConfig, FakeDataset, UnevenDataset
 from tflane_jax.datasets.batches import batches
 from tflane_jax.datasets.cache import cached
 from tflane_jax.datasets.loading import TRAINING_PARTS, keep, load_arrays, load_or_stream
@@ -159,3 +159,9 @@ def test_examples_that_do_not_stack_are_named(kind, said):
 
     with pytest.raises(UserError, match=said):
         stream_all()
+
+
+@pytest.mark.parametrize("workers", [None, StreamingConfig(threads=1)])
+def test_an_example_that_cannot_be_made_is_named(workers):
+    with pytest.raises(RuntimeError, match=r"broken\n\(raised by example 2 of fake\)"):
+        load(BrokenDataset(FakeConfig(4)), workers=workers)

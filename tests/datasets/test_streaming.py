@@ -147,6 +147,13 @@ def test_processes_of_an_evaluation_load_their_own_rows(make):
     assert sorted(asked.asked) == [2, 3, 6, 6]
 
 
+@pytest.mark.parametrize("size", [0, -1])
+def test_batches_of_nothing_are_refused(size):
+    """Regression: a negative size gave no batch, and so an evaluation of nothing."""
+    with pytest.raises(UserError, match=f"batches of {size} examples hold none"):
+        next(ordered_batches(in_memory(), size))
+
+
 def test_one_example_gives_the_shapes():
     assert_same(first_example(streamed()), first_example(in_memory()))
     assert_same(chosen_examples(streamed(), [5, 0]), chosen_examples(in_memory(), [5, 0]))
@@ -155,7 +162,7 @@ def test_one_example_gives_the_shapes():
 @pytest.mark.parametrize("threads", [0, 2])
 def test_an_error_in_a_worker_reaches_the_caller(threads):
     broken = Streamed(BrokenDataset(FakeConfig(4)), StreamingConfig(threads=threads))
-    with pytest.raises(RuntimeError, match="example 2 is broken"):
+    with pytest.raises(RuntimeError, match=r"broken\n\(raised by example 2 of fake\)"):
         list(broken.stream(lambda number: Request(number, (0, 0, number)), 4))
 
 

@@ -173,3 +173,31 @@ def test_the_hosts_own_mask_keeps_groups_of_queries_apart():
     changed = features.at[4].add(3.0)
     np.testing.assert_array_equal(apply(params, changed, mask)[:3], out[:3])
     assert not np.array_equal(apply(params, changed, None)[:3], out[:3])
+
+
+@pytest.mark.parametrize("where", ["unnamed", "made on the spot"])
+def test_a_module_that_a_prior_does_not_name_is_an_error_that_names_the_prior(where):
+    """Regression: Flax's error told of unbound modules, and of neither prior nor remedy."""
+
+    class Own(Prior):
+        def __init__(self):
+            self.tokens = nn.Dense(2)
+
+        def observe(self, example, memory):
+            return jnp.ones(3), None
+
+        def encode(self, observation, *, deterministic):
+            return self.tokens(observation) if where == "unnamed" else nn.Dense(2)(observation)
+
+    @dataclass(frozen=True)
+    class OwnConfig:
+        def build(self, host):
+            return Own()
+
+    @dataclass(frozen=True)
+    class OwnPriors(PriorsConfig):
+        own: OwnConfig = OwnConfig()
+
+    model = replace(BASELINE, priors=OwnPriors()).build()
+    with pytest.raises(UserError, match=r"encode of the prior own calls a module .*modules\(\), which has none"):
+        jax.eval_shape(model.init, jax.random.key(0), make_example(0))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Annotated, Literal, Protocol, runtime_checkable
+from typing import Annotated, Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -153,6 +153,15 @@ class IndexedExamples(Protocol):
     def info(self, index: int) -> FrameInfo:
         """Return where an example comes from, without making it."""
         ...
+
+
+def made(dataset: IndexedExamples, index: int) -> Any:
+    """Return an example; what its dataset raises gets a note which one it was."""
+    try:
+        return dataset.example(index)
+    except Exception as error:
+        error.add_note(f"(raised by example {index} of {dataset.name})")
+        raise
 
 
 class Dataset(IndexedExamples, Protocol):

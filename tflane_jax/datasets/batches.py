@@ -20,6 +20,7 @@ from jaxtyping import Int
 
 from tflane_jax.datasets.base import FrameInfo
 from tflane_jax.datasets.streaming import InOrder, Prepare, Request, Streamed, StreamingConfig
+from tflane_jax.errors import UserError
 from tflane_jax.scene import row_of, stack_examples
 
 __all__ = [
@@ -161,7 +162,11 @@ def ordered_batches(arrays: Any, batch_size: int, share: tuple[int, int] = (0, 1
         arrays: examples, see the module's docstring.
         batch_size: examples of a batch.
         share: (index, count) of this process among those that divide every batch evenly; it gets its own rows alone.
+
+    Raises UserError for a batch of no examples.
     """
+    if batch_size < 1:
+        raise UserError(f"batches of {batch_size} examples hold none: give a batch_size of 1 or more")
     examples, rows = count(arrays), batch_size // share[1]
     places = range(share[0] * rows, (share[0] + 1) * rows)
     starts = range(0, examples, batch_size)

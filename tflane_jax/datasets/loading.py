@@ -13,7 +13,7 @@ from functools import partial
 import jax
 import numpy as np
 
-from tflane_jax.datasets.base import Dataset
+from tflane_jax.datasets.base import Dataset, made
 from tflane_jax.datasets.cache import CachedDataset
 from tflane_jax.datasets.leaves import Form, check_form, example_from_leaves, example_leaves, form_of
 from tflane_jax.datasets.streaming import InOrder, Streamed, StreamingConfig
@@ -64,7 +64,7 @@ def stream(dataset: Dataset, config: StreamingConfig, parts: Collection[str] = T
         dataset = dataset.only(_checked(parts))
         dataset.check()
         return Streamed(dataset, config, select)
-    first = dataset.example(0)
+    first = made(dataset, 0)
     _check_first(dataset, first)
     return Streamed(dataset, config, select, form=form_of(example_leaves(select(first))))
 
@@ -110,7 +110,7 @@ def _stacked(
 ) -> Mapping[str, np.ndarray]:
     """Make every example and write it straight into the stacked arrays, so that memory holds the data only once."""
     leaves: dict[str, np.ndarray] = {}
-    count, examples = len(dataset), map(dataset.example, range(len(dataset)))
+    count, examples = len(dataset), map(partial(made, dataset), range(len(dataset)))
     if workers is not None:
         examples = Streamed(dataset, workers).stream(InOrder(count), count)
     bar = progress_bar(examples, f"loading {dataset.name}", unit="example", total=count, disable=not progress)

@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from tflane_jax.child_processes import end_with_parent, spared_interrupts
-from tflane_jax.datasets.base import IndexedExamples
+from tflane_jax.datasets.base import IndexedExamples, made
 from tflane_jax.datasets.leaves import check_form, example_leaves
 from tflane_jax.errors import UserError
 from tflane_jax.progress import progress_bar
@@ -42,7 +42,7 @@ _WORKER_ENVIRONMENT = {
 def frame_leaves(dataset: IndexedExamples, index: int) -> tuple[dict[str, np.ndarray], str]:
     """Return the arrays of one example, those of its `FrameInfo` under "info.", and the name of its scene."""
     info = dataset.info(index)
-    leaves = example_leaves(dataset.example(index))
+    leaves = example_leaves(made(dataset, index))
     leaves["info.timestamp_ns"] = np.asarray(info.timestamp_ns, np.int64)
     leaves["info.global_from_ego"] = np.asarray(info.global_from_ego, np.float64)
     return leaves, info.scene

@@ -15,7 +15,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from tflane_jax.cores import own_cores
-from tflane_jax.datasets.base import IndexedExamples
+from tflane_jax.datasets.base import IndexedExamples, made
 from tflane_jax.datasets.leaves import Form, check_form, example_leaves
 from tflane_jax.errors import UserError, missing_extra
 from tflane_jax.limits import Count, CountOrZero
@@ -110,7 +110,7 @@ class Streamed:
 
     def example(self, index: int) -> Any:
         """Return the selected part of one example."""
-        example = self.dataset.example(index)
+        example = made(self.dataset, index)
         example = example if self.select is None else self.select(example)
         if self.form is not None:
             check_form(self.dataset.name, index, example_leaves(example), self.form)

@@ -13,6 +13,7 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 import numpy as np
+from flax.errors import AssignSubModuleError, CallCompactUnboundModuleError
 from jax import lax
 from jaxtyping import Array, Float
 
@@ -93,8 +94,17 @@ def observe_clip(priors: Mapping[str, Prior], clip: Example) -> ByPrior:
 
 
 def encode(priors: Mapping[str, Prior], observations: ByPrior, *, deterministic: bool) -> ByPrior:
-    """Return the tokens of every prior."""
-    return {name: prior.encode(observations[name], deterministic=deterministic) for name, prior in priors.items()}
+    """Return the tokens of every prior; raise UserError for one that calls a module which it does not name."""
+    tokens = {}
+    for name, prior in priors.items():
+        try:
+            tokens[name] = prior.encode(observations[name], deterministic=deterministic)
+        except (CallCompactUnboundModuleError, AssignSubModuleError) as error:
+            raise UserError(
+                f"encode of the prior {name} calls a module that is not part of the host: make it in __init__ and "
+                f"return it from modules(), which has {', '.join(prior.modules()) or 'none'}"
+            ) from error
+    return tokens
 
 
 def bev_hook(priors: Mapping[str, Prior], tokens: ByPrior, host: HostSpec) -> BevHook | None:

@@ -194,6 +194,12 @@ def test_the_command_line_trains_on_two_processes(tmp_path):
     for code, _, errors in ended([[*train, str(folder), *joined, str(i)] for i in range(2)]):
         assert code == 2
         assert f"{folder} already holds a run" in errors.splitlines()[-1]
+    joined[1], rates = f"localhost:{free_port()}", (["--optim.lr", "0.01"], ["--optim.lr", "0.02"])
+    commands = [[*train, str(tmp_path / "other"), *joined, str(i), *rate] for i, rate in enumerate(rates)]
+    for code, _, errors in ended(commands):
+        assert code == 2
+        assert "its settings are not those of the first process (optim.lr: 0.01 there, 0.02 here)" in errors
+    assert not (tmp_path / "other").exists()
 
 
 @pytest.mark.slow

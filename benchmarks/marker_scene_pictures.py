@@ -14,7 +14,7 @@ from tflane_jax.geometry import relative_pose
 from tflane_jax.plots import new_figure, save_figure
 from tflane_jax.plots.bev import draw_ego, draw_found, draw_lanes, draw_scene, prepare
 from tflane_jax.plots.gallery import label_edges, panel_size
-from tflane_jax.plots.legends import hidden_entry, prediction_entries, truth_entry, visibility_entries
+from tflane_jax.plots.legends import hidden_entries, prediction_entries, truth_entry, visibility_entries
 from tflane_jax.plots.marker_drive import OUTCOMES, draw_boards, draw_guidance, trust_colours
 from tflane_jax.plots.style import ROAD
 from tflane_jax.priors.marker_memory import MarkerGuidance
@@ -157,7 +157,7 @@ def _entries() -> list[Any]:
             for colour, c in ((trusted, 1), (half, 0.5), (doubted, 0))
         ),
         *visibility_entries(),
-        hidden_entry(),
+        *hidden_entries(),
         truth_entry(),
         *prediction_entries(),
     ]

@@ -5,11 +5,10 @@ import pytest
 
 from tests.fakes import empty_example, fake_example
 from tests.plots.test_bev import lines
-from tflane_jax.plots import gallery
+from tflane_jax.plots import add_legend, new_figure
 from tflane_jax.plots.bev import INPUTS, draw_scene, inputs_title
-from tflane_jax.plots.gallery import save_examples
-from tflane_jax.plots.priors import draw_markers, draw_sd_map, prior_entries
-from tflane_jax.scene import MarkerObservations, SdMap, stack_examples
+from tflane_jax.plots.priors import draw_markers, draw_sd_map
+from tflane_jax.scene import MarkerObservations, RoadUser, SdMap
 
 pytest.importorskip("matplotlib")
 LANE = np.array([[0.0, 1.0, 0.0], [5.0, 1.0, 0.0], [9.0, 2.0, 0.0]], np.float32)
@@ -57,11 +56,24 @@ def test_a_panel_names_the_inputs_that_it_shows(ax):
     assert len(lines(ax)) == 2
 
 
-def test_the_legend_names_priors_that_the_examples_have(tmp_path, monkeypatch):
-    named = []
-    monkeypatch.setattr(gallery, "add_legend", lambda *_, priors, **__: named.extend(e.get_label() for e in priors))
-    for more in ({}, {"markers": boards(1)}, {"markers": boards(0), "sd_map": roads(1)}):
-        save_examples(tmp_path / "a.png", stack_examples([fake_example().replace(**more)]))
-    board = ["board detected", "lane in its store"]
-    assert named == [*board, *board, "road of the SD map"]
-    assert prior_entries(fake_example()) == []
+def test_legends_name_the_inputs_that_the_examples_have():
+    """Regression: pictures of models with cameras explained the colours of an evidence that they did not show."""
+
+    def named(example):
+        figure, _ = new_figure()
+        add_legend(figure, examples=example)
+        (legend,) = figure.legends
+        return {text.get_text() for text in legend.get_texts()}
+
+    example = fake_example()
+    least = named(example.replace(bev=None, hidden=None, traffic_flow=None))
+    board, road = {"board detected", "lane in its store"}, {"road of the SD map"}
+    assert named(example.replace(markers=boards(0))) - named(example) == board
+    assert named(example.replace(markers=boards(1), sd_map=roads(1))) - named(example) == board | road
+    assert named(example) - named(example.replace(hidden=None)) == {"ground out of sight"}
+    evidence = named(example) - named(example.replace(bev=None))
+    assert evidence == {f"evidence: {name}" for name in ("lane paint", "road edge", "crossing", "obstacle")}
+    users = named(example) - named(example.replace(traffic_flow=None))
+    assert users == {*(user.name.lower() for user in RoadUser), "road user not seen"}
+    assert named(example) == least | evidence | users | {"ground out of sight"}
+    assert named(None) == named(example)

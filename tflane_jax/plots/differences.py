@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -17,7 +17,8 @@ from tflane_jax.plots.figure import new_figure, save_figure
 from tflane_jax.plots.gallery import label_edges, panel_size
 from tflane_jax.plots.legends import (
     boundary_entries,
-    hidden_entry,
+    evidence_entries,
+    hidden_entries,
     prediction_entries,
     truth_entry,
     visibility_entries,
@@ -108,7 +109,7 @@ def save_differences(
             draw_outlines(ax, lanes[found], "filled")
             draw_outlines(ax, lanes[outlined[row] & ~found], "dashed")
     label_edges(axes)
-    _add_legend(figure, caption, meaning, truth_layers(shown), prior_entries(examples))
+    _add_legend(figure, caption, meaning, truth_layers(shown), examples)
     return save_figure(figure, path)
 
 
@@ -141,25 +142,25 @@ def band(line: Float[np.ndarray, "n 2"], half_width: float) -> Float[np.ndarray,
     return np.concatenate([line - half_width * left, (line + half_width * left)[::-1]])
 
 
-def _add_legend(figure: Figure, caption: str, meaning: str, drawn: Collection[Layer], priors: Sequence[Any]) -> None:
+def _add_legend(figure: Figure, caption: str, meaning: str, drawn: Collection[Layer], examples: Example) -> None:
     from matplotlib.patches import Patch
 
     edge = {"edgecolor": style.OUTLINE, "lw": 1.3}
     car = style.ROAD_USER[RoadUser.CAR]
+    traffic = [
+        Patch(facecolor=car + "8c", edgecolor=car, label="road user, its track"),
+        Patch(facecolor="none", edgecolor=car, label="not seen at present"),
+    ]
     entries: list = [  # column by column
         Patch(facecolor="none", label=meaning, **edge),
         truth_entry(),
         Patch(facecolor=style.OUTLINE + "4d", label="this model finds it", **edge),
         Patch(facecolor="none", ls="--", label="this model misses it", **edge),
         *(class_entries() if "map_lines" in drawn else [*prediction_entries(), *visibility_entries()]),
-        hidden_entry(),
-        Patch(facecolor=car + "8c", edgecolor=car, label="road user, its track"),
-        Patch(facecolor="none", edgecolor=car, label="not seen at present"),
-        *(
-            Patch(facecolor=style.EVIDENCE[channel], label=f"evidence: {channel.name.lower().replace('_', ' ')}")
-            for channel in (BevChannel.LANE_PAINT, BevChannel.ROAD_EDGE, BevChannel.OBSTACLE)
-        ),
-        *priors,
+        *hidden_entries(examples),
+        *([] if examples.traffic_flow is None else traffic),
+        *evidence_entries(examples, (BevChannel.LANE_PAINT, BevChannel.ROAD_EDGE, BevChannel.OBSTACLE)),
+        *prior_entries(examples),
         *(boundary_entries() if "segments" in drawn else ()),
     ]
     legend = figure.legend(

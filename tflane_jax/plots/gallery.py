@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Literal, TypeVar
 
 import numpy as np
 
@@ -16,7 +16,8 @@ from tflane_jax.plots.figure import hide_unused, new_figure, save_figure
 from tflane_jax.plots.legends import (
     boundary_entries,
     crossing_entry,
-    hidden_entry,
+    evidence_entries,
+    hidden_entries,
     prediction_entries,
     truth_entry,
     visibility_entries,
@@ -96,7 +97,7 @@ def save_examples(
         for ax, (name, stacked) in zip(columns, predictions.items(), strict=True):
             draw_found(ax, example, row_of(stacked, row), ground=ground, view=view, threshold=threshold, title=name)
     label_edges(axes)
-    add_legend(figure, "with predictions" if predictions else "scenes", drawn=true, priors=prior_entries(examples))
+    add_legend(figure, "with predictions" if predictions else "scenes", drawn=true, examples=examples)
     return save_figure(figure, path)
 
 
@@ -129,11 +130,10 @@ def show_dataset(
     pairs, inches, dpi = (2, _SMALL_PANEL_WIDTH, _SMALL_PANEL_DPI) if len(chosen) > 1 else (1, _PANEL_WIDTH, 110)
     figure, axes = new_figure(-(-len(chosen) // pairs), 2 * pairs, panel=panel_size(view, inches), footer=_FOOTER)
     true: tuple[Layer, ...] = ()
-    priors: list = []
+    example: Example | None = None
     for (truth, seen), index in zip(axes.reshape(-1, 2), chosen.tolist(), strict=False):
         example, info = dataset.example(index), dataset.info(index)
         true = truth_layers(None) if example.map_lines is None else ("map_lines",)
-        priors = prior_entries(example)
         draw_scene(
             truth,
             example,
@@ -145,7 +145,7 @@ def show_dataset(
         draw_scene(seen, example, layers=INPUTS, ground=ground, view=view, title=inputs_title(example))
     hide_unused(axes, 2 * len(chosen))
     label_edges(axes)
-    add_legend(figure, "scenes", drawn=true, priors=priors)
+    add_legend(figure, "scenes", drawn=true, examples=example)
     return save_figure(figure, out, dpi=dpi)
 
 
@@ -154,31 +154,31 @@ def add_legend(
     kind: Literal["scenes", "with predictions"] = "scenes",
     *,
     drawn: Collection[Layer] = ("lanes",),
-    priors: Sequence[Any] = (),
+    examples: Example | None = None,
 ) -> None:
     """Add the legend of all colours below the panels, once for the figure.
 
     Args:
-        figure: with evidence and traffic.
+        figure: to which it is added.
         kind: whether it has predictions.
         drawn: layers of true lanes.
-        priors: entries of other priors than traffic, see `prior_entries`.
+        examples: whose inputs are named, one or several; None: evidence and traffic.
     """
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
     entries: list = [
         *(class_entries() if "map_lines" in drawn else visibility_entries()),
-        hidden_entry(),
-        *(Patch(facecolor=colour, label=user.name.lower()) for user, colour in style.ROAD_USER.items()),
-        Patch(facecolor="none", edgecolor=style.OTHER_ELEMENT, label="road user not seen"),
+        *hidden_entries(examples),
+    ]
+    if examples is None or examples.traffic_flow is not None:
+        entries += [Patch(facecolor=colour, label=user.name.lower()) for user, colour in style.ROAD_USER.items()]
+        entries.append(Patch(facecolor="none", edgecolor=style.OTHER_ELEMENT, label="road user not seen"))
+    entries += [
         Line2D([], [], color=style.LIGHT[2], lw=0, marker="o", ms=4, mec="black", label="traffic light"),
         Line2D([], [], color=style.OTHER_ELEMENT, lw=0, marker="s", ms=4, mec="black", label="traffic sign"),
-        *(
-            Patch(facecolor=colour, label=f"evidence: {channel.name.lower().replace('_', ' ')}")
-            for channel, colour in style.EVIDENCE.items()
-        ),
-        *priors,
+        *evidence_entries(examples),
+        *([] if examples is None else prior_entries(examples)),
     ]
     if kind == "with predictions":
         entries.append(truth_entry())

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 from tflane_jax.plots import style
 from tflane_jax.plots.priors import prior_entries
 from tflane_jax.plots.segments import LINE_STYLES, LanePrediction
-from tflane_jax.scene import Example, LinePrediction, LineType
+from tflane_jax.scene import BevChannel, Example, LinePrediction, LineType
 
 if TYPE_CHECKING:
     from matplotlib.lines import Line2D
@@ -56,11 +57,23 @@ def boundary_entries(colour: str = "#b0b3ba") -> list:
     ]
 
 
-def hidden_entry() -> Patch:
-    """Return the entry of a legend for ground out of sight."""
+def hidden_entries(examples: Example | None = None) -> list:
+    """Return the entry of a legend for ground out of sight, if examples have it; None: as if they had."""
     from matplotlib.patches import Patch
 
-    return Patch(facecolor="#0f1116", edgecolor=style.HATCH, hatch="////", lw=0, label="ground out of sight")
+    if examples is not None and examples.hidden is None:
+        return []
+    return [Patch(facecolor="#0f1116", edgecolor=style.HATCH, hatch="////", lw=0, label="ground out of sight")]
+
+
+def evidence_entries(examples: Example | None = None, channels: Iterable[BevChannel] = tuple(style.EVIDENCE)) -> list:
+    """Return the entries of a legend for channels of the evidence, if examples have it; None: as if they had."""
+    from matplotlib.patches import Patch
+
+    if examples is not None and examples.bev is None:
+        return []
+    names = {channel: channel.name.lower().replace("_", " ") for channel in channels}
+    return [Patch(facecolor=style.EVIDENCE[channel], label=f"evidence: {name}") for channel, name in names.items()]
 
 
 def crossing_entry() -> Patch:
@@ -74,5 +87,5 @@ def above_entries(lanes: LanePrediction | None, examples: Example) -> list:
     """Return the entries of a legend for the view from above, beside camera images that explain the rest."""
     if lanes is None:
         lanes_seen = [] if examples.map_lines is not None else visibility_entries()
-        return [hidden_entry(), *lanes_seen, *prior_entries(examples)]
+        return [*hidden_entries(examples), *lanes_seen, *prior_entries(examples)]
     return [] if isinstance(lanes, LinePrediction) else [truth_entry(), *prediction_entries()]

@@ -196,7 +196,8 @@ def train(
             example = example if prepare is None else prepare(example, (config.seeds[0], 0, 0))
             states = init_states(task, optimizer, config.seeds, example)
         window, metrics, times = Window(), {}, StepTime()
-        memories, started_from = [Memory() for _ in config.seeds], {"own_code": own_code}
+        memories = [Memory() for _ in config.seeds]
+        started_from: dict[str, Any] = {"own_code": own_code}
         data, due = {"examples": example_count(arrays), "content": content}, False
         agree_on_data(data)
         if start == "resume" and (saved := from_first(lambda: latest(checkpoints))) is not None:

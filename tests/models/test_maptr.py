@@ -15,6 +15,7 @@ from tflane_jax.errors import UserError
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.layers.masks import SpatialMask
 from tflane_jax.losses.maptr import MapTrLossConfig
+from tflane_jax.models.auxiliary import AUXILIARY
 from tflane_jax.models.lane_denoising import DenoisingConfig
 from tflane_jax.models.map_lines import LineHeads
 from tflane_jax.models.maptr import MapTr
@@ -146,6 +147,29 @@ def test_it_trains_with_denoising_and_all_its_parameters_learn():
         if not any(np.any(x) for x in jax.tree.leaves(leaf))
     ]
     assert not silent
+
+
+def test_lines_of_classes_that_the_model_lacks_are_not_denoised():
+    """Regression: queries were put on them, and learned that there is nothing."""
+    example = make_line_example(3)
+    foreign = example.map_lines.replace(category=np.where(np.arange(len(example.map_lines.valid)) == 0, 3, 0))
+    gone = foreign.replace(valid=foreign.valid & (np.arange(len(foreign.valid)) > 0))
+    assert foreign.valid[0]
+    module = replace(LINES, decoder=replace(LINES.decoder, anchors="spread"), denoising=DenoisingConfig()).build()
+
+    def denoised(lines):
+        _, seen = module.init_with_output(
+            {"params": jax.random.key(0), "dropout": jax.random.key(1)},
+            *(BEV, None, lines),
+            deterministic=False,
+            method=MapTr.decode,
+            mutable=["params", AUXILIARY],
+        )
+        return seen[AUXILIARY]["denoised"]
+
+    jax.tree.map(np.testing.assert_array_equal, denoised(foreign), denoised(gone))
+    four = denoised(foreign.replace(category=np.zeros_like(foreign.category)))
+    assert any((a != b).any() for a, b in zip(jax.tree.leaves(four), jax.tree.leaves(denoised(gone)), strict=True))
 
 
 @pytest.mark.parametrize("attention", with_slow(["kernel", "deformable"], quick=["kernel"]))

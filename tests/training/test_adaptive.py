@@ -80,6 +80,14 @@ def test_warm_up_and_the_end_of_a_cycle_are_left_alone():
     assert (memory.best, verdict) == (0.5, "go on")
 
 
+@pytest.mark.parametrize(("left", "extend", "verdict"), [(40, 0.5, "go on"), (41, 0.5, "extend"), (99, 0.0, "go on")])
+def test_an_extension_that_would_change_nothing_is_none(left, extend, verdict):
+    """Regression: the last cycle of a run was recorded as extended, and stayed as it was."""
+    leading, config = Memory(best=1.0, cycle_best=1.0), dataclasses.replace(RULE, extend=extend)
+    memory, found = judge(config, leading, 0.5, number=0, elapsed=60, length=100, left=left)
+    assert (found, memory.extensions) == (verdict, int(verdict == "extend"))
+
+
 @pytest.mark.parametrize(("left", "verdict"), [(59, "go on"), (60, "restart")])
 def test_no_restart_near_the_end_of_the_run(left, verdict):
     stuck = Memory(best=1.0, cycle_best=1.0, stale=5)

@@ -100,7 +100,7 @@ def test_restarts_have_no_schedule_by_step():
 def test_an_extension_keeps_the_rate_and_has_the_configured_length(elapsed, left, extend, run_left):
     config, steps = RestartsConfig(elapsed + left, floor=0.2), elapsed + run_left
     cycle = jax.device_get(first_cycle(config, 0, steps))._replace(count=np.int32(elapsed))
-    longer = extended_cycle(cycle, extend, steps)
+    longer = extended_cycle(config, cycle, extend, steps)
     lasts = int(longer.start + longer.length - longer.count)
     assert lasts == max(left, min(round(left * (1 + extend)), run_left))
     # Whole steps: the place in the cycle may move by one.
@@ -180,6 +180,34 @@ def test_a_fitted_run_ends_at_a_low_rate_whatever_the_rule_decides():
     rates = rates_with(losses, count=64, optim=optim, steps=64)
     assert len(np.unique(rates, axis=1).T) > 3
     assert (rates[-1] < 0.8 * 0.3).all()
+
+
+@pytest.mark.parametrize(
+    ("cycle_steps", "rule", "losses"),
+    [
+        (100, {"max_extensions": 3}, {30: 1.0, 50: 0.5, 60: 0.25, 75: 0.125}),
+        (100, {"extend": 1.0, "max_extensions": 2}, {30: 1.0, 50: 0.5, 105: 0.25}),
+        (30, {"extend": 1.0, "fraction": 1.0, "grace": 0.0}, {1: 1.0, 2: 0.5}),
+    ],
+)
+def test_a_fitted_run_does_not_end_with_a_few_steps_at_the_peak(cycle_steps, rule, losses):
+    """Regression: after an extension one to five steps were left, and became a cycle of their own."""
+    adaptive = AdaptiveConfig(metric="loss", **rule)
+    restarts = RestartsConfig(cycle_steps, 1.0, last_cycle="fit", adaptive=adaptive)
+    optim, steps = OptimConfig(lr=1.0, warmup_steps=0, restarts=restarts), 2 * cycle_steps
+    rates = rates_with({step: [loss] for step, loss in losses.items()}, count=steps, optim=optim, steps=steps)
+    assert rates[-cycle_steps // 2 :].max() < 0.9
+    assert (np.diff(rates[:, 0]) < 0.01).all()  # one cycle, or none after the first began
+    assert rates[-1] < 0.01
+
+
+def test_an_extended_cycle_leaves_the_next_one_at_least_half_or_nothing():
+    config = RestartsConfig(100, 1.0, last_cycle="fit")
+    cycle = jax.device_get(first_cycle(config, 0, 250))._replace(count=np.int32(80))
+    for steps, end in ((150, 150), (159, 159), (160, 110), (300, 110)):
+        longer = extended_cycle(config, cycle, 0.5, steps)
+        assert longer.start + longer.length == end, steps
+        assert longer.count == 80
 
 
 def test_cycles_are_recorded():

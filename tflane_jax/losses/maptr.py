@@ -128,8 +128,7 @@ def line_targets(lines: MapLines, coordinates: int, classes: int, rings: Ways = 
         classes: of the model, the first ones of `LineClass`.
         rings: directions of a ring.
     """
-    category = jnp.asarray(lines.category)
-    valid = lines.valid & (category < classes)
+    category, valid = jnp.asarray(lines.category), lines.of_classes(classes).valid
     points = jnp.where(valid[:, None, None], jnp.asarray(lines.points)[..., :coordinates], 0.0)
     directed = category == LineClass.CENTERLINE
     orders, order_valid = point_orders(points, jnp.asarray(lines.closed), directed, rings)

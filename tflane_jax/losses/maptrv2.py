@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -44,8 +44,8 @@ class MapTrV2LossConfig(MapTrLossConfig):
     def auxiliary_terms(self, name: str, output: Any, targets: LineTargets, batch: Example, host: Any) -> Terms:
         """Return the weighted losses of an auxiliary output, see `MapTrLossConfig.auxiliary_terms`."""
         range_ = host.bev_range
-        lines: Any = of_classes(batch.map_lines, host.decoder.classes)
-        views: Any = batch.cameras
+        lines: Any = batch.map_lines
+        lines, views = lines.of_classes(host.decoder.classes), cast(Any, batch.cameras)  # no mask shows the others
         if name == "one_to_many":
             terms = one_to_many_losses(output, targets, range_, self)
             return {f"many_{key}": self.many_weight * value for key, value in terms.items()}
@@ -64,11 +64,6 @@ class MapTrV2LossConfig(MapTrLossConfig):
             bins, valid = jax.vmap(each)(views)
             return {"depth": self.depth_weight * depth_loss(output, bins, valid)[None]}
         return super().auxiliary_terms(name, output, targets, batch, host)
-
-
-def of_classes(lines: Any, classes: int) -> Any:
-    """Return map lines with those of classes that the model lacks marked invalid, so that no mask shows them."""
-    return replace(lines, valid=lines.valid & (lines.category < classes))
 
 
 def one_to_many_losses(

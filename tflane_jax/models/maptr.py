@@ -212,7 +212,8 @@ class MapTr(Host):
         rest = bev, None, tokens or {}, deterministic
         if config.denoising is None or lines is None or not self.is_mutable_collection(AUXILIARY):
             return self.decode_queries(start, *rest)
-        noised = NoisedLines(config.decoder, config.denoising, range_, name="noised")(lines)
+        taught = lines.of_classes(config.decoder.classes)
+        noised = NoisedLines(config.decoder, config.denoising, range_, name="noised")(taught)
         return decode_groups(self, start, noised, *rest)
 
     def decode_queries(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+from dataclasses import replace
 
 import numpy as np
 from flax import struct
@@ -146,6 +147,10 @@ class MapLines:
             identity=label.copy(),
             dense=None if dense is None else np.zeros((capacity, dense, 3), np.float32),
         )
+
+    def of_classes(self, count: int) -> MapLines:
+        """Return the same lines; those of other classes than the first `count` of `LineClass` are invalid."""
+        return replace(self, valid=self.valid & (self.category < count))
 
     def validate(self) -> None:
         """Raise AssertionError naming the first field whose shape does not fit."""

@@ -10,7 +10,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
+
+import numpy as np
 
 from tflane_jax.limits import Count, CountOrZero, Factor, Fraction, FractionBelowOne, PositiveOrZero
 
@@ -26,7 +28,8 @@ class AdaptiveConfig:
 
     1. Extend: the evaluation is better than all that counted in the run, the cycle is in its last `fraction` but has
        not ended, and it was extended fewer than `max_extensions` times. The rest of the cycle then takes 1 + `extend`
-       times as long, at most up to the end of the run. The learning rate continues without a jump.
+       times as long, at most up to the end of the run (`RestartsConfig.last_cycle` may let it take all of that). The
+       learning rate continues without a jump. A cycle whose rest would not grow is not extended.
     2. Restart: the last `patience` evaluations are not better than the best earlier one of this cycle, the cycle has
        not ended, and the run has at least as many steps left as the cycle has had (so that no run ends at the high
        rates of a new cycle). The next update begins a cycle with this one's period. From then on the peak is only
@@ -99,12 +102,19 @@ def judge(
             memory = replace(memory, best=value)
         memory = replace(memory, cycle_best=value, stale=0)
         late = (1.0 - config.fraction) * length <= elapsed < length
-        if leads and late and memory.extensions < config.max_extensions:
+        rest = length - elapsed
+        longer = extended_rest(rest, left, config.extend) > rest
+        if leads and late and longer and memory.extensions < config.max_extensions:
             return replace(memory, extensions=memory.extensions + 1), "extend"
         return memory, "go on"
     memory = replace(memory, stale=memory.stale + 1)
     stuck = memory.stale >= config.patience and elapsed < length
     return memory, "restart" if stuck and left >= elapsed else "go on"
+
+
+def extended_rest(rest: Any, left: Any, extend: float) -> Any:
+    """Return how many steps an extension makes of the rest of a cycle (numpy, whole); `left` are left in the run."""
+    return np.maximum(np.minimum(np.round(rest * (1.0 + extend)), left), rest)
 
 
 def _is_better(config: AdaptiveConfig, value: float, best: float | None) -> bool:

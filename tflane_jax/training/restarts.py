@@ -23,7 +23,7 @@ from jaxtyping import Array, ArrayLike, Float, Int
 
 from tflane_jax.errors import UserError
 from tflane_jax.limits import Fraction, at_least, below
-from tflane_jax.training.adaptive import AdaptiveConfig, Memory, judge
+from tflane_jax.training.adaptive import AdaptiveConfig, Memory, extended_rest, judge
 
 _LONGEST = 2**29  # steps; twice that still is an int32
 
@@ -39,7 +39,7 @@ class RestartsConfig:
         factor: length of a cycle relative to the one before it, at least 1.
         floor: least learning rate, eta_min, relative to the peak, eta_max.
         last_cycle: "cut": the run may end within a cycle. "fit": a cycle after which the next one could not be
-            completed takes all steps that are left.
+            completed takes all steps that are left; so does one that is extended and leaves less than half of the next.
         adaptive: rule that changes cycles by the evaluations; None for fixed cycles.
     """
 
@@ -211,7 +211,7 @@ def adapt(
     ]
     memories, verdicts = [memory for memory, _ in judged], np.array([verdict for _, verdict in judged])
     for verdict, change in (
-        ("extend", extended_cycle(cycle, adaptive.extend, steps)),
+        ("extend", extended_cycle(config, cycle, adaptive.extend, steps)),
         ("restart", restarted_cycle(config, cycle, adaptive.shrink, steps)),
     ):
         chosen = np.reshape(verdicts == verdict, cycle.count.shape)
@@ -220,15 +220,19 @@ def adapt(
     return with_cycle(opt_state, cycle), memories, values | {"extensions": [m.extensions for m in memories]}
 
 
-def extended_cycle(cycle: Any, extend: float, steps: int) -> Any:
-    """Return a cycle (numpy) whose rest takes 1 + `extend` times as long, at most up to the end of the run.
+def extended_cycle(config: RestartsConfig, cycle: Any, extend: float, steps: int) -> Any:
+    """Return a cycle (numpy) whose rest takes longer, see `extended_rest`.
 
     The elapsed steps are stretched by the same factor, so that the learning rate does not jump (up to the rounding to
     whole steps).
     """
-    elapsed = cycle.count - cycle.start
+    elapsed, run_left = cycle.count - cycle.start, steps - cycle.count
     left = cycle.length - elapsed
-    longer = np.maximum(np.minimum(np.round(left * (1.0 + extend)), steps - cycle.count), left)
+    longer = extended_rest(left, run_left, extend)
+    if config.last_cycle == "fit":
+        # Else the run could end with a few steps at the peak of a new cycle.
+        too_few = 2 * (run_left - longer) < np.asarray(next_period(config, cycle.period))
+        longer = np.where(too_few, np.maximum(run_left, left), longer)
     stretched = np.minimum(np.round(elapsed * (longer / np.maximum(left, 1))), _LONGEST)
     start, length = cycle.count - stretched, stretched + longer
     return cycle._replace(start=start.astype(np.int32), length=length.astype(np.int32))

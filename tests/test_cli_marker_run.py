@@ -131,6 +131,7 @@ def test_both_boards_of_one_id_are_counted_and_recorded(drive, tmp_path, capsys)
         ({"family": "QR"}, "ARUCO_5X5_100"),
         ({"max-age-days": -1}, "--max-age-days"),
         ({"interval": 0}, "--interval"),
+        ({"interval": float("inf")}, "--interval is a positive number of seconds, not inf"),
         ({"model": "gone"}, "gone"),
     ],
 )

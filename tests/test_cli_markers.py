@@ -120,6 +120,26 @@ def test_a_damaged_photo_is_named_and_the_others_are_searched(photos, tmp_path, 
     assert "a.png" in said.out
 
 
+def test_a_photo_with_the_longest_name_that_a_file_can_have_gets_a_picture(photos, tmp_path):
+    """Regression: that of the picture is longer, and the answers of all photos were lost."""
+    (photos / "b.png").rename(photos / f"{'道' * 83}é.png")  # 255 bytes
+    assert main(["markers", "detect", str(photos), *INTRINSICS, "--out", str(tmp_path / "out")]) == 0
+    first, second = json.loads((tmp_path / "out" / "detections.json").read_text())["photos"]
+    assert [marker["id"] for marker in first["markers"]] == [12]
+    assert second["picture"] == f"001-{'道' * 66}-markers.png"
+    assert (tmp_path / "out" / second["picture"]).is_file()
+
+
+def test_a_picture_that_cannot_be_written_is_a_fault_of_its_photo(photos, tmp_path, capsys):
+    out = tmp_path / "out"
+    (out / "000-a-markers.png").mkdir(parents=True)
+    assert main(["markers", "detect", str(photos), *INTRINSICS, "--out", str(out)]) == 2
+    written = json.loads((out / "detections.json").read_text())
+    assert [photo["picture"] for photo in written["photos"]] == ["001-b-markers.png"]
+    assert written["faults"][0]["file"].endswith("a.png")
+    assert "000-a-markers.png" in capsys.readouterr().err
+
+
 def test_intrinsics_of_another_image_size_are_a_fault(photos, tmp_path, capsys):
     """The principal point lies outside; a pose would be silently wrong."""
     out = tmp_path / "out"
@@ -143,7 +163,13 @@ def test_intrinsics_of_another_image_size_are_a_fault(photos, tmp_path, capsys):
         (["--enlarge", "0"], "tflane: --enlarge is 0: it must be"),
         (["--height", "nan"], "tflane: --height takes finite numbers"),
         (["--pitch", "inf"], "tflane: --pitch takes finite numbers"),
-        (["--height", "-1"], "tflane: --height is that of the camera above the ground, metres, above 0, not -1"),
+        (
+            ["--height", "-1"],
+            "--height is that of the camera above the ground, above 0 and up to 100 metres, not -1",
+        ),
+        (["--height", "1e39"], "above 0 and up to 100 metres, not 1e+39"),
+        (["--distortion", "1e30", "0", "0", "0"], "tflane: --distortion holds numbers up to 100, not 1e+30"),
+        (["--intrinsics", "1e30", "900", "480", "270"], "with FX and FY above 0 and up to 1,000,000, not 1e+30 900"),
         (["--pitch", "91"], "tflane: --pitch is from -90 to 90 degrees, not 91"),
         (["--distortion", "0.1", "nan", "0", "0"], "tflane: --distortion takes finite numbers"),
         (["--intrinsics", "900", "900", "nan", "1"], "tflane: --intrinsics takes finite numbers"),

@@ -86,7 +86,8 @@ def test_thin_paint_survives_a_strong_reduction():
     [
         ((0, 5), PhotoCamera(), "5 x 0 pixels shows nothing"),
         ((600, 800), PhotoCamera(focal=26.0), "26 pixels is too short .* 800 x focal length / sensor width"),
-        ((600, 800), PhotoCamera(focal=float("nan")), "too short"),
+        ((600, 800), PhotoCamera(focal=float("nan")), "a focal length of nan is no number of pixels"),
+        ((600, 800), PhotoCamera(focal=float("inf")), "a focal length of inf is no number of pixels"),
         ((600, 800), PhotoCamera(horizon=600.0), "horizon, row 600, is below"),
         ((600, 800), PhotoCamera(horizon=float("nan")), "horizon"),
         (

@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.datasets.small_logs import lane_map, segment
+from tflane_jax.errors import UserError
 from tflane_jax.geometry import PerceptionRange, invert_pose, yaw_pose
 from tflane_jax.markers.observe import observe
 from tflane_jax.markers.simulation import SimulatedMarkers
@@ -238,3 +239,14 @@ def test_lanes_move_with_the_frame_and_residuals_do_not(x, y, yaw):
         np.testing.assert_allclose(there.lanes[b][used], moved, atol=1e-3)
         assert there.residual[b] == pytest.approx(here.residual[a], abs=1e-3)
         assert here.residual[a] > 0.1
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_pose_that_is_not_finite_is_named(value):
+    """Regression: it became a valid marker with lanes of NaN."""
+    pose = PLACED.pose.copy()
+    pose[1, 0, 3] = value
+    with pytest.raises(UserError, match="the detected pose of marker 8 is not finite: mark such a row invalid"):
+        observe(detect(pose), STORE, RANGE, **SIZES)
+    used = observe(detect(pose, valid=[True, False, True]), STORE, RANGE, **SIZES)
+    assert sorted(rows_of(used.markers)) == [2, 5]

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from tests.markers.test_detection import AHEAD, degrees_between, pose
@@ -14,16 +14,24 @@ from tflane_jax.markers.square_pose import marker_outline, solve_square
 pytest.importorskip("cv2")
 
 
+def rolled(degrees: float) -> np.ndarray:
+    """Return a rotation of a board in its plane."""
+    cos, sin = np.cos(np.deg2rad(degrees)), np.sin(np.deg2rad(degrees))
+    return np.array([[cos, -sin, 0, 0], [sin, cos, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+
+
 @given(
     x=st.floats(4.0, 40.0),
     bearing=st.floats(-0.4, 0.4),
     z=st.floats(0.5, 4.0),
     turn=st.floats(-70.0, 70.0),
+    roll=st.sampled_from([0.0, 90.0, 180.0, 270.0]) | st.floats(0.0, 360.0),
 )
-@settings(max_examples=30)
-def test_exact_corners_give_the_exact_pose(x, bearing, z, turn):
-    """Turned far enough for the two poses to differ, the right one is preferred."""
-    truth = pose(x, bearing * x, z, turn)
+@example(10.0, 0.1, 2.0, 11.0, 180.0)  # wrong by 13 degrees before
+@settings(max_examples=60)
+def test_exact_corners_give_the_exact_pose(x, bearing, z, turn, roll):
+    """Turned far enough for the two poses to differ, the right one is preferred; also of a board on its head."""
+    truth = pose(x, bearing * x, z, turn) @ rolled(roll)
     corners = marker_outline(truth, 1.0, AHEAD.intrinsics, AHEAD.camera_from_ego)
     fit = solve_square(corners, AHEAD.intrinsics, AHEAD.camera_from_ego)
     found = invert_pose(AHEAD.camera_from_ego) @ fit.camera_from_marker

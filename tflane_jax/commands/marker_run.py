@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import argparse
 import datetime
+import math
 import sys
 import warnings
 from collections import Counter
@@ -76,7 +77,7 @@ def run(options: argparse.Namespace) -> int:
     opencv()  # without it, every image would be a fault
     store, drive = load_store(options.store), load_drive(options.poses, options.images)
     if options.interval is not None:
-        if not options.interval > 0.0:
+        if not 0.0 < options.interval < math.inf:
             raise UserError(f"--interval is a positive number of seconds, not {options.interval:g}")
         drive = thinned(drive, options.interval)
     model = None if options.model is None else _model(options.model)

@@ -7,8 +7,8 @@ detections.json:
      "faults": [{"file", "error"}, ...]}
     Position and pose (ego_from_marker, 4 x 4) are in the ego frame, on the ground below the camera: x forward, y left,
     z up, metres. Corners of the black square are pixels of the undistorted photo. An id that is read at two places has
-    two entries, both `contradictory`. `faults` are photos that could not be read or are of another size than the
-    intrinsics.
+    two entries, both `contradictory`. `faults` are photos that could not be read, are of another size than the
+    intrinsics, or whose picture could not be written.
 
 `curves` writes curves-NAME.md and .json for each curve, and curves.png.
 """
@@ -16,6 +16,7 @@ detections.json:
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -25,6 +26,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from tflane_jax.commands.sources import make_folder
+from tflane_jax.datasets.plausible import LARGEST_DISTORTION, MOST_PIXELS
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import check_folder, check_replaces, write_bytes, write_json
 from tflane_jax.files.images import check_centre, list_photos, opencv, read_image, undistorted
@@ -44,6 +46,9 @@ from tflane_jax.world.render.camera import camera_pose
 
 _AXES = np.array([(255, 40, 40), (40, 200, 40), (60, 90, 255)])
 _OUTLINE, _CONTRADICTORY, _DARK = (255, 210, 0), style.rgb(OUTCOMES["contradictory"]), style.rgb(style.ROAD)
+
+_HIGHEST = 100.0  # of a camera above the ground, metres
+_LONGEST_STEM = 200  # bytes of a photo's name in that of its picture
 
 Box = tuple[int, int, int, int]
 
@@ -71,12 +76,17 @@ def find(options: argparse.Namespace) -> int:
     for name in ("intrinsics", "distortion", "height", "pitch"):
         if not np.isfinite(getattr(options, name) or 0.0).all():
             raise UserError(f"--{name} takes finite numbers, not nan or inf")
-    if not options.height > 0.0:
-        raise UserError(f"--height is that of the camera above the ground, metres, above 0, not {options.height:g}")
+    if np.abs(distortion).max(initial=0.0) > LARGEST_DISTORTION:
+        raise UserError(f"--distortion holds numbers up to {LARGEST_DISTORTION:g}, not {np.abs(distortion).max():g}")
+    if not 0.0 < options.height <= _HIGHEST:
+        raise UserError(
+            f"--height is that of the camera above the ground, above 0 and up to {_HIGHEST:g} metres, not "
+            f"{options.height:g}"
+        )
     if not abs(options.pitch) <= 90.0:
         raise UserError(f"--pitch is from -90 to 90 degrees, not {options.pitch:g}")
     intrinsics, pose = _intrinsics(options.intrinsics), camera_pose(options.height, np.deg2rad(options.pitch))
-    pictures = {path: f"{number:03d}-{path.stem}-markers.png" for number, path in enumerate(photos)}
+    pictures = {path: f"{number:03d}-{_short(path.stem)}-markers.png" for number, path in enumerate(photos)}
     check_replaces({options.out / name: path for path, name in pictures.items()}, photos)
     make_folder(options.out)
     rows, records, faults, twice = [], [], [], []
@@ -85,12 +95,12 @@ def find(options: argparse.Namespace) -> int:
             check_name(path)
             photo = read_image(path)
             check_centre(path, photo, intrinsics)
+            photo = undistorted(photo, intrinsics, distortion)
+            found = detect(_views(photo, intrinsics, pose), config)
+            _write_picture(options.out / picture, photo, found, config.size, config.family, intrinsics, pose)
         except UserError as error:
             faults.append({"file": plain_name(path), "error": str(error)})
             continue
-        photo = undistorted(photo, intrinsics, distortion)
-        found = detect(_views(photo, intrinsics, pose), config)
-        _write_picture(options.out / picture, photo, found, config.size, config.family, intrinsics, pose)
         here = [_record(found, k, intrinsics, pose) for k in np.flatnonzero(found.valid).tolist()]
         twice += _contradictions(path, here)
         records.append({"file": str(path), "picture": picture, "markers": here})
@@ -172,10 +182,18 @@ def _family(name: str) -> MarkerFamily:
     return MarkerFamily[name]
 
 
+def _short(stem: str) -> str:
+    """Return the part of a name to which others can be added: file systems allow 255 bytes."""
+    return os.fsencode(stem)[:_LONGEST_STEM].decode(errors="ignore")
+
+
 def _intrinsics(numbers: list[float]) -> Float[np.ndarray, "3 3"]:
     fx, fy, cx, cy = numbers
-    if not (fx > 0.0 and fy > 0.0):
-        raise UserError(f"--intrinsics are FX FY CX CY in pixels with positive FX and FY, not {fx:g} {fy:g}")
+    if not (0.0 < fx <= MOST_PIXELS and 0.0 < fy <= MOST_PIXELS):
+        raise UserError(
+            f"--intrinsics are FX FY CX CY in pixels, with FX and FY above 0 and up to {MOST_PIXELS:,.0f}, not {fx:g} "
+            f"{fy:g}"
+        )
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
 

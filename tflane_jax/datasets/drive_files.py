@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from tflane_jax.datasets.plausible import LARGEST_IMAGE, check_motion
+from tflane_jax.datasets.plausible import LARGEST_DISTORTION, LARGEST_IMAGE, check_motion
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import write_json
 from tflane_jax.files.fields import file_within, items, load_json, member, numbers, whole_number
@@ -35,7 +35,7 @@ from tflane_jax.scene import CameraViews
 
 FORMAT, VERSION = "tflane-drive", 1
 # Largest coordinate of a pose, metres; largest coefficient of lens distortion.
-_FARTHEST, _DISTORTED = 1e8, 100.0
+_FARTHEST = 1e8
 _LONGEST_NAME = 200
 
 
@@ -205,8 +205,10 @@ def _camera(entry: Any, where: str) -> DriveCamera:
     distortion = numbers(entry.get("distortion") or [], (None,), f"{where}: distortion")
     if len(distortion) not in (0, 4, 5, 8):
         raise UserError(f"{where}: distortion has {len(distortion)} numbers, OpenCV's has 4, 5 or 8")
-    if (np.abs(distortion) > _DISTORTED).any():
-        raise UserError(f"{where}: distortion holds {np.abs(distortion).max():g}, expected at most {_DISTORTED:g}")
+    if (np.abs(distortion) > LARGEST_DISTORTION).any():
+        raise UserError(
+            f"{where}: distortion holds {np.abs(distortion).max():g}, expected at most {LARGEST_DISTORTION:g}"
+        )
     size = None
     if entry.get("size") is not None:
         size = tuple(whole_number(side, 1, LARGEST_IMAGE, f"{where}: size") for side in items(entry, "size", where))

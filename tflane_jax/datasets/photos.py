@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -112,6 +113,8 @@ def _seen(height: int, width: int, camera: PhotoCamera) -> Placement:
     if not 0.0 <= ahead <= width:
         raise UserError(f"the column straight ahead, {ahead:g}, is outside a photo {width} pixels wide")
     if camera.focal is not None:
+        if not math.isfinite(camera.focal):
+            raise UserError(f"a focal length of {camera.focal:g} is no number of pixels: leave it out if it is unknown")
         columns = camera.focal / FOCAL
         if not columns >= _LEAST_SEEN * width:
             raise UserError(

@@ -24,6 +24,8 @@ FARTHEST, MOST_PIXELS = 1e8, 1e6
 """Metres of a coordinate, and pixels of a camera matrix; more would be infinite in float32, or senseless."""
 LARGEST_IMAGE = 20_000
 """Pixels of a side of an image; arrays are made for the sizes that a calibration names."""
+LARGEST_DISTORTION = 100.0
+"""Largest of OpenCV's coefficients; with more, no pixel of an image would be left."""
 # Metres from the vehicle to a box; the annotators of nuScenes saw some 150 m far.
 _UNSEEN = 500.0
 

@@ -55,7 +55,7 @@ def transform_points(pose: Float[AnyArray, "*b n n"], points: Float[AnyArray, "*
 
 
 def matrix_from_quaternion(quaternion: Float[ArrayT, "*b 4"]) -> Float[ArrayT, "*b 3 3"]:
-    """Return the rotation matrix of a quaternion (w, x, y, z) of any non-zero norm."""
+    """Return the rotation matrix of a quaternion (w, x, y, z) of any norm whose square is a normal number."""
     xp = namespace(quaternion)
     q = quaternion / xp.sqrt((quaternion**2).sum(-1, keepdims=True))
     w, x, y, z = (q[..., i] for i in range(4))

@@ -13,6 +13,7 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from jaxtyping import Float
 
+from tflane_jax.errors import UserError
 from tflane_jax.geometry import PerceptionRange, clip_to_range, nearest_lines, resample_lines, transform_points
 from tflane_jax.markers.store import MarkerStore, StoredMarker, look_up
 from tflane_jax.scene import MarkerObservations
@@ -100,6 +101,8 @@ def observe(
         now_from_previous: pose of that ego frame in this one; needed with `previous`.
         first_residual: residual of a marker that is not in `previous`, metres.
         today, max_age_days: see `look_up`; None ignores dates.
+
+    Raises UserError for a pose that is not finite.
     """
     if previous is not None and now_from_previous is None:
         raise ValueError("previous detections need the vehicle's motion since: give now_from_previous")
@@ -116,6 +119,8 @@ def observe(
             outcomes[number] = "used" if len(entry.lanes) else "no lanes"
     known = [(row, entry) for row, entry in zip(rows, looked.found, strict=True) if entry is not None]
     poses = {int(row): np.asarray(detected.pose[row], np.float64) for row, _ in known}
+    if wrong := [row for row, pose in poses.items() if not np.isfinite(pose).all()]:
+        raise UserError(f"the detected pose of marker {int(ids[wrong[0]])} is not finite: mark such a row invalid")
     known.sort(key=lambda pair: (not len(pair[1].lanes), np.hypot(*poses[int(pair[0])][:2, 3])))
 
     out, lanes_dropped = MarkerObservations.empty(markers, lanes, points), 0

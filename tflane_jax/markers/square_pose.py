@@ -14,6 +14,8 @@ from tflane_jax.markers.image_search import DetectorConfig
 
 # Corners of a marker of size 2 in its own frame, in OpenCV's order: upper left, upper right, lower right, lower left.
 _SQUARE = np.array([(-1.0, 1.0, 0.0), (1.0, 1.0, 0.0), (1.0, -1.0, 0.0), (-1.0, -1.0, 0.0)])
+# Rotations by quarters of a turn about z, which take each corner to the place of the one before it.
+_QUARTERS = np.stack([np.linalg.matrix_power([[0, -1, 0], [1, 0, 0], [0, 0, 1]], k) for k in range(4)]).astype(float)
 # Added to both errors of a pose ratio, so that the ratio of two perfect fits is 1, pixels.
 _EXACT = 1e-3
 # Moves the corners by less than a ten-thousandth of a pixel.
@@ -59,8 +61,11 @@ def solve_square(
     rays = np.column_stack([corners, np.ones(4)]) @ np.linalg.inv(np.asarray(intrinsics, np.float64)).T
     # A marker that faces the camera is rotated by about 180 degrees, where OpenCV's rotation vectors are unstable
     # (always for an upright marker and a level camera). So the problem is solved with y of the image and z of the
-    # marker mirrored, where the rotation is small; z does not matter for a flat square.
+    # marker mirrored, where the rotation is small; z does not matter for a flat square. A marker on its side or head
+    # is solved as the upright one that looks the same, and turned back.
     seen = rays[:, :2] / rays[:, 2:] * [1.0, -1.0]
+    quarters = int(np.argmax([upper.mean(0)[1] for upper in (seen[[k, (k + 1) % 4]] for k in range(4))]))
+    seen = np.roll(seen, -quarters, axis=0)
     count, turns, places = _two_poses(cv2, square, seen)
     if not np.isfinite(turns).all():
         # Exactly from the front OpenCV takes the root of a number that rounding makes negative.
@@ -69,7 +74,7 @@ def solve_square(
         return SquarePose(np.tile(np.eye(4), (2, 1, 1)), np.full(2, np.inf))
     mirror, back = np.array([1.0, -1.0, 1.0]), np.array([1.0, 1.0, -1.0])
     rotation = mirror[:, None] * np.stack([cv2.Rodrigues(turn)[0] for turn in turns]) * back
-    poses = pose_matrix(rotation, mirror * places)
+    poses = pose_matrix(rotation @ _QUARTERS[quarters], mirror * places)
     if count == 1:
         poses = np.concatenate([poses, poses])
     pixels, _, _ = project(square[None], np.asarray(intrinsics, np.float64), poses)

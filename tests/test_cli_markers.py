@@ -184,7 +184,14 @@ def test_errors_name_the_remedy(photos, tmp_path, capsys, change, words):
 @pytest.mark.parametrize(
     "option",
     [
-        *("--scales -1", "--scales 0.2000001 0.2000002", "--seeds 0", "--sigma-d 0", "--distances 0.5"),
+        *(
+            "--scales -1",
+            "--scales 0.2000001 0.2000002",
+            "--seeds 0",
+            "--sigma-d 0",
+            "--sigma-d inf",
+            "--distances 0.5",
+        ),
         *("--distances 1e9", "--severity 2", "--enlarge 1000"),
     ],
 )

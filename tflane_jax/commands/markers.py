@@ -129,7 +129,7 @@ def curves(options: argparse.Namespace) -> int:
     """Measure detection rate and pose error over distance; write tables and a picture."""
     if min(options.scales) <= 0.0:
         raise UserError(f"--scales are positive fractions of the native image size, not {min(options.scales):g}")
-    if not options.sigma_d > 0.0:
+    if not 0.0 < options.sigma_d < np.inf:
         raise UserError(f"--sigma-d must be a positive distance in metres, not {options.sigma_d:g}")
     check_folder(options.out)
     for name in ("distances", "scales", "corners"):

@@ -64,10 +64,13 @@ def test_lanes_of_a_geojson_file_have_their_places_markings_and_successors(tmp_p
     assert len(prepare_roads(town, 1.8).spots(55.0)) > 10
 
 
-def test_a_map_across_the_180th_meridian_is_the_same_elsewhere(tmp_path):
+@pytest.mark.parametrize("east", [-0.0003, 0.0003])
+def test_a_map_across_the_180th_meridian_is_the_same_elsewhere(tmp_path, east):
+    """Its middle lies on either side. Regression: on the western one, no map was read."""
+
     def there(coordinates):
         if not isinstance(coordinates[0], list):
-            return [(coordinates[0] - 10.0 + 360.0) % 360.0 - 180.0, coordinates[1]]  # 10 degrees east becomes 180
+            return [(coordinates[0] - 10.0 + east + 360.0) % 360.0 - 180.0, coordinates[1]]  # 10 degrees become 180
         return [there(one) for one in coordinates]
 
     plain, moved = crossroads_features(), crossroads_features()

@@ -4,6 +4,7 @@ import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ from tflane_jax.config import OpenLaneV2Data, RunConfig
 from tflane_jax.datasets.argoverse2_export import export_tracks
 from tflane_jax.datasets.argoverse2_log import ANNOTATIONS, POSES, load_log
 from tflane_jax.datasets.base import ExampleConfig, MissingTracksWarning
-from tflane_jax.datasets.nuscenes_export import export_scenes
+from tflane_jax.datasets.nuscenes_export import _sample_frames, export_scenes
 from tflane_jax.datasets.openlane_check import check_openlane_v2
 from tflane_jax.datasets.openlane_tracks import SourceTracks
 from tflane_jax.datasets.openlane_v2 import OpenLaneV2Config, OpenLaneV2Dataset, nominal_example
@@ -109,6 +110,18 @@ def test_frames_get_the_tracks_that_they_had(subset, index, request):
     np.testing.assert_allclose(got[3], expected[3], rtol=1e-6)
     np.testing.assert_array_equal(got[4], expected[4])
     assert made.traffic_flow.occluded.sum() == read.traffic_flow.occluded.sum()
+
+
+def test_samples_are_two_a_second_and_hold_the_key_frames():
+    """Regression: with key frames 19 steps apart, every frame of 10 Hz became a sample."""
+    moments = [20, 40, 59, 61, 79]
+    drive_ = SimpleNamespace(
+        keyframes=[SimpleNamespace(track_frame=moment) for moment in moments], rate_hz=10.0, timestamps_ns=range(90)
+    )
+    frames = _sample_frames(drive_)
+    assert set(moments) <= set(frames.tolist())
+    assert frames.tolist()[:10] == [0, 5, 10, 15, 20, 25, 30, 35, 40, 44]
+    assert frames.tolist()[10:] == [49, 54, 59, 61, 64, 69, 74, 79, 84, 89]
 
 
 @pytest.mark.parametrize("first", [0, 6, 12])

@@ -145,7 +145,8 @@ def test_a_class_that_a_part_lacks_does_not_count_there():
         "AP_boundary": 1.0,
         "recall": 1.0,
     }
-    assert samples["all"]["mAP"] == pytest.approx([2 / 3, 1 / 3, 0.0])
+    # The sample of the second frame lacks dividers, which the whole has: that is the luck of the draw, not a 0.
+    assert samples["all"]["mAP"] == pytest.approx([2 / 3, 1 / 2, 0.0])
     assert samples["clear"]["mAP"].tolist() == [1.0, 1.0, 0.0]
     parts = {"occluded": {0}, "clear": {2}, "both": {0, 2}, "boundary": {2}, "dividers": {0}, "none": (), "nowhere": ()}
     for part, present in parts.items():

@@ -185,6 +185,13 @@ def test_beyond_capacity_the_nearest_pieces_stay_in_order():
     assert dropped == 0
 
 
+def test_the_nearest_piece_is_the_one_whose_line_passes_nearest():
+    """Regression: its points decided, and those of a long road are far apart."""
+    road, walk = np.array([[-45.0, 0.0], [40.0, 0.5]]), np.array([[-10.0, 2.0], [10.0, 2.0]])
+    sd_map, dropped = pack_lines([road, walk], [0, 1], capacity=1, points=11, range_=PerceptionRange())
+    assert (sd_map.category.tolist(), dropped) == ([0], 1)
+
+
 def test_examples_have_the_map_and_are_otherwise_as_they_were():
     recording = log_on(STRAIGHT, POSE)
     config = ExampleConfig(sd_map=SdMapConfig(lines=3))

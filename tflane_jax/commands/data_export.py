@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -44,6 +45,7 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> int:
     tracks: Path | None = options.tracks
     _check_folders(options.out, tracks)
     _check_cameras(chosen)
+    chosen = {split: _with_corners(source) for split, source in chosen.items()}
     driven = {} if tracks is None else _driven(chosen)
     datasets: dict[Split, Any] = {split: sources.open_dataset(source) for split, source in chosen.items()}
     out = export_openlane_v2(datasets, options.out, images=options.images, sd_maps=_sd_maps(chosen))
@@ -57,6 +59,11 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> int:
     if found.faults:
         raise UserError(f"what was written to {out} has faults: {found.faults[0]}")
     return 0
+
+
+def _with_corners(source: Any) -> Any:
+    """Return a source whose crossings keep their corners, which OpenLane-V2 stores and equally spaced points miss."""
+    return replace(source, example=replace(source.example, crossings="sides"))
 
 
 def _check_folders(out: Path, tracks: Path | None) -> None:

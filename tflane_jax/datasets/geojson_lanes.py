@@ -84,7 +84,8 @@ def read_lanes(path: Path) -> RoadMap:
     if np.ptp(degrees[:, 0]) > 180.0:  # the map spans the 180th meridian
         degrees[:, 0] %= 360.0
     middle = degrees.mean(0)
-    origin = Origin(latitude=float(middle[1]), longitude=float(middle[0]), heading=90.0)
+    longitude = (float(middle[0]) + 180.0) % 360.0 - 180.0
+    origin = Origin(latitude=float(middle[1]), longitude=longitude, heading=90.0)
     segments = _segments(
         {key: (_metres(line, origin, name), props, name) for key, (line, props, name) in lanes.items()}
     )

@@ -7,7 +7,6 @@ scenes of which its segments are parts.
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
@@ -40,8 +39,8 @@ Tables = dict[str, list[dict[str, Any]]]
 def export_scenes(logs: Iterable[Log], out: Path, time_offset: Callable[[int], int] = lambda _: 0) -> Path:
     """Write logs as the thirteen tables in `<out>/v1.0-trainval`, all or none of them.
 
-    Samples are the track frames at 2 Hz that contain the key frames. A box that its tracker did not see has no lidar
-    points; every other has one. The lidar is at the vehicle's origin.
+    Samples are the key frames and track frames at 2 Hz before each of them. A box that its tracker did not see has no
+    lidar points; every other has one. The lidar is at the vehicle's origin.
 
     Args:
         logs: of all splits; their names become those of the scenes.
@@ -102,11 +101,14 @@ def _add_scene(tables: Tables, log: Log, offset: int) -> None:
 
 
 def _sample_frames(log: Log) -> np.ndarray:
-    """Return the track frames that become samples: 2 Hz, and all at key frames."""
+    """Return the track frames that become samples: the key frames, 2 Hz before each of them, and after the last."""
     moments = [moment.track_frame for moment in log.keyframes]
     step = max(round((log.rate_hz or _RATE_HZ) / _RATE_HZ), 1)
-    step = math.gcd(step, *(moment - moments[0] for moment in moments))
-    return np.arange(moments[0] % step, len(log.timestamps_ns), step)
+    frames = [*moments, *range(moments[-1], len(log.timestamps_ns), step)]
+    # Key frames need not be whole steps apart: where the steps of one meet the key frame before, one is 0.25 to 0.75 s.
+    for before, moment in zip([None, *moments], moments, strict=False):
+        frames += range(moment, -1 if before is None else before + step // 2, -step)
+    return np.unique(frames)
 
 
 def _boxes(log: Log, frame: int, sample: str) -> list[dict[str, Any]]:

@@ -104,10 +104,20 @@ class VectorMapMetrics:
           program prints it under its tables (0 if there is none). `mAP` is their mean only if no class is missing;
         - `recall`: fraction of the true lines that are found, whatever the confidence; mean over the thresholds.
         """
+        return self._numbers(_counted(self._truths.sum(0), scope))
+
+    def compute_sample(self, whole: VectorMapMetrics) -> dict[str, float]:
+        """Return the metrics of frames that were drawn from a whole test set; `compute` has the names.
+
+        A class that the test set has and the sample lacks is left out: 0, as officially, would be the luck of the draw.
+        """
+        return self._numbers(_counted_in_sample(self._truths.sum(0), whole._truths.sum(0), "all"))
+
+    def _numbers(self, counted: Bool[np.ndarray, "4"]) -> dict[str, float]:
         thresholds, truths = self.thresholds, self._truths.sum(0)
         scores, classes, hits = ranked(*pooled(self._detections, (0,), (len(thresholds), 0)))
         hits, lines = hits.astype(bool), int(truths.sum())
-        measured = np.flatnonzero(_counted(truths, scope))
+        measured = np.flatnonzero(counted)
         precision = {
             LINE_CLASSES[c]: [average_precision_area(scores[own], row[own], int(truths[c])) for row in hits]
             for c in measured
@@ -146,7 +156,7 @@ class VectorMapMetrics:
             precision[f"AP_{LINE_CLASSES[c]}"] = area.mean(1)
         if not precision:
             return {}
-        counted = _counted((weights @ truths).T, scope)[measured]
+        counted = _counted_in_sample((weights @ truths).T, truths.sum(0)[:, None], scope)[measured]
         return {"mAP": _mean_precision(np.stack(list(precision.values()))[:, None], counted)} | precision
 
     @property
@@ -161,6 +171,13 @@ def _counted(truths: Int[np.ndarray, "4 *b"], scope: Scope) -> Bool[np.ndarray, 
     if scope == "all":
         counted[: len(CLASSES)] = True
     return counted
+
+
+def _counted_in_sample(
+    truths: Int[np.ndarray, "4 *b"], whole: Int[np.ndarray, "4 *#b"], scope: Scope
+) -> Bool[np.ndarray, "4 *b"]:
+    """Return which classes of `_counted` count in samples of a test set: not those that it has and they lack."""
+    return _counted(truths, scope) & ((truths > 0) | (whole == 0))
 
 
 def _mean_precision(

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol, Self
+from typing import Any, Protocol, Self, runtime_checkable
 
 import numpy as np
 
@@ -41,6 +41,15 @@ class Accumulator(Protocol):
         ...
 
 
+@runtime_checkable
+class SampledAccumulator(Protocol):
+    """An accumulator whose numbers of a random sample have rules of their own."""
+
+    def compute_sample(self, whole: Any) -> dict[str, Any]:
+        """Return the numbers of frames that were drawn from those of `whole`."""
+        ...
+
+
 def numbers_of(metrics: Accumulator) -> dict[str, Any]:
     """Return the numbers of an accumulator."""
     return metrics.compute()
@@ -68,20 +77,24 @@ class Scored:
     def intervals(self, samples: int, *, progress: bool = True) -> dict[str, tuple[float, float]]:
         """Return 95 % percentile bootstrap intervals of the numbers: scenes are drawn with replacement `samples` times.
 
-        A number that some samples do not have, such as an error of matched lanes where none is matched, has none.
+        A number that some samples do not have, such as an error of matched lanes where none is matched or the AP of a
+        class that few scenes have, has none.
 
         Raises UserError for fewer than two scenes.
         """
         scenes = list(self.scenes.values())
         check_bootstrap(len(scenes))
+        whole = _merged(scenes)
         rng = np.random.default_rng(0)
         drawn: dict[str, list[float]] = {}
         for _ in progress_bar(range(samples), desc="bootstrap", unit="sample", disable=not progress):
             chosen = [scenes[i] for i in rng.integers(0, len(scenes), len(scenes))]
-            for name, value in _merged(chosen).compute().items():
+            sample = _merged(chosen)
+            sampled = isinstance(sample, SampledAccumulator)
+            for name, value in (sample.compute_sample(whole) if sampled else sample.compute()).items():
                 drawn.setdefault(name, []).append(value)
-        whole = {name: values for name, values in drawn.items() if len(values) == samples}
-        return {name: tuple(np.quantile(values, _TAILS).tolist()) for name, values in whole.items()}
+        always = {name: values for name, values in drawn.items() if len(values) == samples}
+        return {name: tuple(np.quantile(values, _TAILS).tolist()) for name, values in always.items()}
 
 
 def score(

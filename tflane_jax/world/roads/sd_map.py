@@ -15,7 +15,15 @@ import numpy as np
 from jaxtyping import Float
 
 from tflane_jax.errors import UserError
-from tflane_jax.geometry import BevGrid, PerceptionRange, clip_to_range, invert_pose, resample_lines, transform_points
+from tflane_jax.geometry import (
+    BevGrid,
+    PerceptionRange,
+    clip_to_range,
+    invert_pose,
+    nearest_lines,
+    resample_lines,
+    transform_points,
+)
 from tflane_jax.geometry.poses import yaw_pose
 from tflane_jax.limits import Count, Positive, PositiveOrZero, counted
 from tflane_jax.scene import SdCategory, SdMap
@@ -125,8 +133,7 @@ def pack_lines(
     if not pieces:
         return sd_map, 0
     found = resample_lines([piece for piece, _ in pieces], points)
-    distance = np.linalg.norm(found, axis=-1).min(-1)
-    kept = np.sort(np.argsort(distance, kind="stable")[:capacity])
+    kept = nearest_lines([piece for piece, _ in pieces], capacity)
     n = len(kept)
     sd_map.points[:n] = found[kept]
     sd_map.category[:n] = np.array([label for _, label in pieces])[kept]

@@ -63,6 +63,16 @@ def test_a_boundary_that_is_outside_keeps_the_stretch_beside_the_centerline():
     assert along == pytest.approx(whole * 41 / 76, abs=1.0)
 
 
+def test_a_boundary_that_is_inside_elsewhere_keeps_the_stretch_beside_the_centerline():
+    """Regression: a lane that turns round outside of the range got the side of its way back."""
+    way = [(0.0, 24.5), (-4.0, 24.8), (-8.0, 30.0), (-8.0, 36.0), (0.0, 36.0), (10.0, 26.2), (40.0, 26.2)]
+    graph = crop(lane_map(segment(0, way)), flavour="segments").graph
+    assert graph.valid.sum() == 1
+    np.testing.assert_allclose(graph.points[0, 0, :2], [0.0, 24.5], atol=1e-5)
+    assert graph.right[0, :, 0].max() < 3.0
+    assert graph.right[0, :, 1].min() > 25.0
+
+
 def test_a_lane_cut_in_two_joins_its_neighbours_only_at_its_own_ends():
     # Leaves the range to the left and comes back.
     loop = segment(1, [(-20.0, 0.0), (-20.0, 60.0), (20.0, 60.0), (20.0, 0.0)], [2, 3])

@@ -31,6 +31,8 @@ from tflane_jax.world.cameras.sensor import ElementViews
 
 # Metres; traffic elements farther away are not ground truth.
 ELEMENT_DISTANCE = 60.0
+# Metres along a lane, about its width: ends of a boundary may be ahead of or behind those of the centerline.
+_BESIDE = 3.5
 # Points on each centerline at which line of sight is tested: about one per metre of the longest lanes.
 _SIGHT_SAMPLES = 101
 
@@ -133,16 +135,27 @@ def _boundary_of(part: np.ndarray, line: np.ndarray, whole: np.ndarray, range_: 
     """Return the piece of a boundary that belongs to a piece of its centerline.
 
     If several pieces of the boundary are inside the range, the one nearest to the middle of the centerline's piece; if
-    none is, the part of the boundary at the same fractions of its length.
+    none is that lies beside this piece, the part of the boundary at the same fractions of its length.
     """
     inside = clip_to_range(line, range_)
-    if len(inside) == 1:
+    if len(inside) == 1 and np.array_equal(part, whole):
         return inside[0]
+    start, stop = (_position_along(whole, end) for end in (part[0], part[-1]))
+    inside = [piece for piece in inside if _lies_beside(piece, whole, start, stop)]
     if inside:
         middle = sample_at(part, np.array([arc_length(part)[-1] / 2]))[0, :2]
         return min(inside, key=lambda piece: np.linalg.norm(piece[:, :2] - middle, axis=-1).min())
-    span = np.array([_position_along(whole, end) for end in (part[0], part[-1])]) / arc_length(whole)[-1]
+    span = np.array([start, stop]) / arc_length(whole)[-1]
     return sample_at(line, np.linspace(span[0], span[1], 11) * arc_length(line)[-1])
+
+
+def _lies_beside(piece: np.ndarray, whole: np.ndarray, start: float, stop: float) -> bool:
+    """Return whether a boundary's piece is beside a stretch of the centerline, or nearly so.
+
+    A lane that leaves the range and comes back may have a centerline inside where the boundary is outside.
+    """
+    first, last = sorted(_position_along(whole, end) for end in (piece[0], piece[-1]))
+    return first - stop <= _BESIDE and start - last <= _BESIDE
 
 
 def _position_along(line: np.ndarray, point: np.ndarray) -> float:

@@ -159,11 +159,19 @@ def test_a_jpeg_looks_the_same(tmp_path):
 
 
 def test_the_command_writes_checks_and_counts(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("tflane_jax.datasets.sources.open_dataset", lambda source: DriveDataset())
+    opened = []
+
+    def open_dataset(source):
+        opened.append(source)
+        return DriveDataset()
+
+    monkeypatch.setattr("tflane_jax.datasets.sources.open_dataset", open_dataset)
     (tmp_path / "config.py").write_text("from tflane_jax.config import RunConfig as get_config")
     command = ["data", "export", "--config", str(tmp_path / "config.py"), "--out", str(tmp_path / "out")]
     command += ["--data.example.cameras", "default"]
     assert main([*command, "--splits", "val", "test", "--data.val", "5"]) == 0
+    # Points along a ring miss its corners, which the official programs read.
+    assert {source.example.crossings for source in opened} == {"sides"}
     said = capsys.readouterr().out
     assert "| val " in said
     assert "| test " in said

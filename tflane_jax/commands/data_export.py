@@ -40,12 +40,13 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> int:
     def choose(given: RunConfig) -> dict[Split, Any]:
         return {split: chosen_source(given, options, split) for split in splits}
 
-    chosen = choose(config)
+    chosen: dict[Split, Any] = choose(config)
     check_used(overrides, before, config, choose, options.data)
     tracks: Path | None = options.tracks
     _check_folders(options.out, tracks)
     _check_cameras(chosen)
-    chosen = {split: _with_corners(source) for split, source in chosen.items()}
+    for split, source in chosen.items():
+        chosen[split] = _with_corners(source)
     driven = {} if tracks is None else _driven(chosen)
     datasets: dict[Split, Any] = {split: sources.open_dataset(source) for split, source in chosen.items()}
     out = export_openlane_v2(datasets, options.out, images=options.images, sd_maps=_sd_maps(chosen))

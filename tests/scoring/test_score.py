@@ -34,7 +34,7 @@ def test_a_class_that_a_draw_lacks_is_no_error():
     scenes = {}
     for number in range(10):
         classes = np.array([0, 2, 1] if number < 2 else [0, 2])
-        lines = [line + [0.0, 9.0 * kind] for kind in classes]
+        lines = [np.add(line, (0.0, 9.0 * kind)) for kind in classes]
         scenes[str(number)] = metrics = VectorMapMetrics()
         metrics.update(MapDetections(lines, classes, np.full(len(lines), 0.9)), MapTruth(lines, classes))
     found = Scored(scenes).intervals(50, progress=False)

@@ -156,7 +156,7 @@ class IndexedExamples(Protocol):
 
 
 def made(dataset: IndexedExamples, index: int) -> Any:
-    """Return an example; what its dataset raises gets a note which one it was."""
+    """Return an example; an error that its dataset raises gets a note that names the example."""
     try:
         return dataset.example(index)
     except Exception as error:

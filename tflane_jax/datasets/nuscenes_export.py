@@ -105,7 +105,7 @@ def _sample_frames(log: Log) -> np.ndarray:
     moments = [moment.track_frame for moment in log.keyframes]
     step = max(round((log.rate_hz or _RATE_HZ) / _RATE_HZ), 1)
     frames = [*moments, *range(moments[-1], len(log.timestamps_ns), step)]
-    # Key frames need not be whole steps apart: where the steps of one meet the key frame before, one is 0.25 to 0.75 s.
+    # Key frames need not be whole steps apart: the first step after one may be shorter or longer, by half at most.
     for before, moment in zip([None, *moments], moments, strict=False):
         frames += range(moment, -1 if before is None else before + step // 2, -step)
     return np.unique(frames)

@@ -44,8 +44,8 @@ class MapTrV2LossConfig(MapTrLossConfig):
     def auxiliary_terms(self, name: str, output: Any, targets: LineTargets, batch: Example, host: Any) -> Terms:
         """Return the weighted losses of an auxiliary output, see `MapTrLossConfig.auxiliary_terms`."""
         range_ = host.bev_range
-        lines: Any = batch.map_lines
-        lines, views = lines.of_classes(host.decoder.classes), cast(Any, batch.cameras)  # no mask shows the others
+        lines = cast(Any, batch.map_lines).of_classes(host.decoder.classes)  # masks show no lines of other classes
+        views: Any = batch.cameras
         if name == "one_to_many":
             terms = one_to_many_losses(output, targets, range_, self)
             return {f"many_{key}": self.many_weight * value for key, value in terms.items()}

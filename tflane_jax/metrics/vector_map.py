@@ -176,7 +176,7 @@ def _counted(truths: Int[np.ndarray, "4 *b"], scope: Scope) -> Bool[np.ndarray, 
 def _counted_in_sample(
     truths: Int[np.ndarray, "4 *b"], whole: Int[np.ndarray, "4 *#b"], scope: Scope
 ) -> Bool[np.ndarray, "4 *b"]:
-    """Return which classes of `_counted` count in samples of a test set: not those that it has and they lack."""
+    """Return which classes of `_counted` count in a sample: not those of the whole test set that the sample lacks."""
     return _counted(truths, scope) & ((truths > 0) | (whole == 0))
 
 

@@ -2,14 +2,16 @@
 
 A recorded run replaces a training with the same configuration, seed and thread setting. If none has the thread setting
 of this process, one with another setting does, because a table is made from what was trained, wherever that was. A run
-that another table recorded is used only if this table has no record of it and this machine has not trained it. Runs of
-a CPU and of an accelerator do not meet in a table, see `with_recorded`.
+that another table recorded is used only if this table has no record of it and this machine has not trained it. Before
+that, rows of a seed that start from one host are taken from the training of it that most of them have. Runs of a CPU
+and of an accelerator do not meet in a table, see `with_recorded`.
 """
 
 from __future__ import annotations
 
 import datetime
 import itertools
+from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -98,7 +100,7 @@ def with_recorded(
     Raises UserError where no run of that kind of device is known.
     """
 
-    def best(same: Sequence[Job]) -> Job:
+    def candidates(same: Sequence[Job]) -> Iterator[Job]:
         def recorded(runs: Mapping[str, RecordedRun]) -> Iterator[Job]:
             for job in same:
                 run = runs.get(job.folder.name)
@@ -107,13 +109,15 @@ def with_recorded(
 
         # A run at hand can be measured for this table; what another one recorded has the parts by scene of its scores.
         at_hand = (job for job in (same if finished else same[:1]) if job.is_complete())
-        return next(itertools.chain(recorded(archive.runs), at_hand, recorded(archive.shared), same))
+        return itertools.chain(recorded(archive.runs), at_hand, recorded(archive.shared), same)
 
     def chosen(allowed: Sequence[Plan]) -> dict[str, list[Job]]:
-        return {
-            name: [best([plan[name][i] for plan in allowed]) for i in range(len(jobs))]
-            for name, jobs in plans[0].items()
-        }
+        return _from_one_host(
+            {
+                name: [list(candidates([plan[name][i] for plan in allowed])) for i in range(len(jobs))]
+                for name, jobs in plans[0].items()
+            }
+        )
 
     by_device: dict[Any, list[Plan]] = {}
     for plan in plans:
@@ -126,6 +130,38 @@ def with_recorded(
         return max(of_each, key=lambda found: _tested(found, declaration.claims))
     found = chosen(plans)
     return found if len({_device(job) for jobs in found.values() for job in jobs}) == 1 else next(of_each)
+
+
+def _from_one_host(candidates: Mapping[str, Sequence[Sequence[Job]]]) -> dict[str, list[Job]]:
+    """Return the first candidate of each run, but of runs with one host those of the training of it that most have.
+
+    Runs of one host name the same folder in `training.init_from`; what its trainings were, `Facts.origins` tells.
+    Where two trainings have as many runs, that of the first candidates counts.
+
+    Args:
+        candidates: for each row and seed the runs that can be taken, best first, at least one.
+    """
+
+    def origins(job: Job) -> tuple[str, ...]:
+        return facts(job).origins if job.is_complete() else ()
+
+    counts: dict[str, Counter[tuple[str, ...]]] = {}
+    for each in itertools.chain.from_iterable(candidates.values()):
+        if host := _host(each):
+            known = dict.fromkeys(origins(job) for job in each)  # each once, in their order
+            counts.setdefault(host, Counter()).update([one for one in known if one])
+    most = {host: count.most_common(1)[0][0] for host, count in counts.items() if count}
+
+    def best(each: Sequence[Job]) -> Job:
+        wanted = most.get(_host(each))
+        return next((job for job in each if wanted and origins(job) == wanted), each[0])
+
+    return {name: [best(each) for each in of_row] for name, of_row in candidates.items()}
+
+
+def _host(same: Sequence[Job]) -> str:
+    """Return the folder of the host from which a run would start if it was trained now; "" for no host."""
+    return same[-1].config.training.init_from or ""
 
 
 def _tested(plan: Plan, claims: Sequence[Claim]) -> tuple[int, int]:

@@ -22,6 +22,7 @@ from tflane_jax.datasets.openlane_splits import openlane_timestamps
 from tflane_jax.datasets.plausible import (
     FARTHEST,
     check_distance,
+    check_headings,
     check_interval,
     check_motion,
     check_place,
@@ -119,6 +120,7 @@ def load_log(
     boxes = _read_boxes(folder / ANNOTATIONS)
     times, at_frames, moments = _drive(folder, boxes["timestamp_ns"], keyframes, openlane)
     tracks = _tracks(boxes, times, categories, folder)
+    check_headings(tracks, at_frames, times, str(folder / ANNOTATIONS))
     city = VectorMap({})
     if with_map:
         city = read_map(folder / "map")

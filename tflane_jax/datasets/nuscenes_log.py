@@ -17,7 +17,14 @@ from jaxtyping import Bool, Float, Int
 
 from tflane_jax.datasets.nuscenes_splits import MISPLACED
 from tflane_jax.datasets.nuscenes_tables import Row, Tables, poses_of, vectors
-from tflane_jax.datasets.plausible import check_distance, check_interval, check_motion, check_place, missing_frames
+from tflane_jax.datasets.plausible import (
+    check_distance,
+    check_headings,
+    check_interval,
+    check_motion,
+    check_place,
+    missing_frames,
+)
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import invert_pose, pose_yaw, relative_pose, transform_points, wrap_angle, yaw_pose
 from tflane_jax.scene import RoadUser
@@ -233,6 +240,8 @@ def scene_tracks(
     tracks.yaw[f, k] = wrap_angle(yaw)
     tracks.occluded[f, k] = _unseen(tables, rows, where, least_visibility)
     tracks.valid[f, k] = True
+    place = tables.where("sample", frames.samples[0]["token"])
+    check_headings(tracks, frames.global_from_frame, frames.timestamps_ns, f"the scene from {place}")
     return tracks
 
 

@@ -27,7 +27,15 @@ from tflane_jax.datasets.lane_outlines import LaneOutline, boundaries
 from tflane_jax.datasets.log_frames import LogOutline
 from tflane_jax.datasets.nuscenes_log import CATEGORIES, road_user, side_of
 from tflane_jax.datasets.nuscenes_map import flat
-from tflane_jax.datasets.plausible import LONGEST, SHORTEST, check_distance, check_motion, check_place, check_steps
+from tflane_jax.datasets.plausible import (
+    LONGEST,
+    SHORTEST,
+    check_distance,
+    check_headings,
+    check_motion,
+    check_place,
+    check_steps,
+)
 from tflane_jax.errors import UserError
 from tflane_jax.files.fields import member, numbers
 from tflane_jax.files.npz import read_npz
@@ -63,6 +71,7 @@ def read_scene_file(path: Path, *, categories: Mapping[str, RoadUser | None] = C
     lanes = [lane.centerline for lane in vector_map.segments.values()]
     check_place(lanes, content["ego_position"][:, :2], str(path))
     tracks = _tracks(content, pose, categories, path)
+    check_headings(tracks, pose, times, f"{path}: yaw")
     return Log(
         name=outline.name,
         source=outline.source,

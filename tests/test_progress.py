@@ -45,6 +45,18 @@ def test_long_work_leaves_a_line_every_half_minute(capsys, clock):
     assert lines[1].endswith("[01:00<04:00,  5.00s/step, loss=1.5]")
 
 
+def test_the_time_left_does_not_count_what_compiling_took(capsys, clock):
+    with progress_bar(desc="train", unit="step", total=100) as bar:
+        for seconds in (60.0, *[10.0] * 9):
+            clock[0] += seconds
+            bar.update(10)
+            bar.update(0)
+    first, second, *_, last = lines_of(capsys)
+    assert first.endswith(" 10/100 [01:00<?, ?step/s]")
+    assert second.endswith(" 40/100 [01:30<01:00,  1.00step/s]")
+    assert last.endswith(" 100/100 [02:30<00:00,  1.50s/step]")  # of the whole
+
+
 def test_unknown_number_of_items(capsys, clock):
     with progress_bar(desc="video", unit="frame") as bar:
         clock[0] += 2.0

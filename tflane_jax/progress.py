@@ -45,7 +45,10 @@ def progress_bar(
 
 
 class ProgressLines(Generic[T]):
-    """Progress as lines of a log: one every half minute, and one at the end. As much of tqdm as is used here."""
+    """Progress as lines of a log: one every half minute, and one at the end. As much of tqdm as is used here.
+
+    The rate counts from the first progress on, because compiling comes before it; at the end it is that of the whole.
+    """
 
     def __init__(self, items: Iterable[T] | None, desc: str, unit: str, total: int | None, initial: int) -> None:
         if total is None and hasattr(items, "__len__"):
@@ -53,13 +56,16 @@ class ProgressLines(Generic[T]):
         self._items, self._unit, self._total, self._initial = items, unit, total, initial
         self._desc, self._postfix = desc, ""
         self._began = self._written = time.monotonic()
+        self._first: tuple[float, int] | None = None  # when the first progress was made, and how far it came
         self.n = initial
 
     def update(self, count: int = 1) -> None:
         """Count what has been done since the last call."""
         self.n += count
+        if count and self._first is None:
+            self._first = time.monotonic(), self.n
         if time.monotonic() - self._written >= _LINE_SECONDS:
-            self._write()
+            self._write(self._rate())
 
     def set_description(self, desc: str) -> None:
         """Name what is done from now on."""
@@ -84,9 +90,15 @@ class ProgressLines(Generic[T]):
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._write()
+        self._write(rate=None)
 
-    def _write(self) -> None:
+    def _rate(self) -> float:
+        """Return the progress in a second; 0, which is shown as unknown, before the second progress."""
+        since, done = self._first or (0.0, self.n)
+        return (self.n - done) / (time.monotonic() - since) if self.n > done else 0.0
+
+    def _write(self, rate: float | None) -> None:
+        """Write a line; with a rate of None, it is the mean since the beginning."""
         self._written = time.monotonic()
         line = tqdm.format_meter(
             self.n,
@@ -95,6 +107,7 @@ class ProgressLines(Generic[T]):
             prefix=self._desc,
             unit=self._unit,
             initial=self._initial,
+            rate=rate,
             postfix=self._postfix or None,
             bar_format=_KNOWN_TOTAL if self._total else _UNKNOWN_TOTAL,
         )

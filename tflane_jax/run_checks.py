@@ -10,7 +10,7 @@ import jax
 
 from tflane_jax.config import RunConfig
 from tflane_jax.config_io import first_difference, settings, to_json
-from tflane_jax.datasets.sources import source_of
+from tflane_jax.datasets.sources import check_labelled, source_of
 from tflane_jax.errors import UserError
 from tflane_jax.limits import SettingError, check_settings
 from tflane_jax.metrics.directions import lower_is_better
@@ -48,14 +48,16 @@ def agree_on_settings(config: RunConfig) -> None:
 def check_run(config: RunConfig) -> None:
     """Raise UserError, naming the setting, where a run with this configuration must fail.
 
-    A limit is broken, data and model do not fit together, a score is named that the evaluation does not compute, or a
-    file or folder of the training or validation data is missing.
+    A limit is broken, data and model do not fit together, a score is named that the evaluation does not compute, a file
+    or folder of the training or validation data is missing, or these data have no truth.
     """
     check_settings(config)
     check_kind(config)
     config.task.check_settings(config.data)
     _check_scores(config)
     _check_files(config)
+    check_labelled(config.data.source("train"), "training")
+    check_labelled(config.data.source("val"), "validation")
 
 
 def check_rate_factors(config: RunConfig) -> None:

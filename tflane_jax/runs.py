@@ -22,7 +22,7 @@ from tflane_jax.config import RunConfig
 from tflane_jax.config_io import added_settings, from_json, to_json, to_text
 from tflane_jax.datasets.batches import in_workers
 from tflane_jax.datasets.data_source import loading_of
-from tflane_jax.datasets.sources import source_of
+from tflane_jax.datasets.sources import check_labelled, source_of
 from tflane_jax.devices import training_mesh
 from tflane_jax.errors import UserError, install
 from tflane_jax.files.atomic import write_json, write_text
@@ -303,6 +303,7 @@ def evaluate_run(
         The metric's protocol with its version, and rows of a table, one per group and seed; with several seeds, their
         means and standard deviations (n - 1) follow.
     """
+    check_labelled(source, "an evaluation")
     task = run.config.task if task is None else task
     further = {"frame_groups": frame_groups} if frame_groups else {}
     seeds, every = run.config.training.seeds, []

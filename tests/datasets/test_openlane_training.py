@@ -167,9 +167,14 @@ def test_a_submission_holds_what_the_model_predicts(data, tmp_path, capsys):
     train_run(config, tmp_path / "run", progress=False)
     submission = tmp_path / "submission.pkl"
     command = ["submit", str(tmp_path / "run"), "--out", str(submission), "--method", "one step"]
-    assert main(command) == 2  # no frame of the split that the configuration tests on is there
+    assert main(command) == 2  # no frame of the official test split is there
     assert main([*command, "--split", "train"]) == 0
     assert f"{SCENES * FRAMES} frames" in capsys.readouterr().out
+    small = tmp_path / "small.pkl"
+    few = ["--out", str(small), "--split", "train", "--most-lanes", "3", "--most-elements", "1"]
+    assert main([*command, *few]) == 0
+    assert {(len(one.points), len(one.elements.scores)) for one in read_predictions(small).values()} == {(3, 1)}
+    assert main([*command, *few[:-1], "0"]) == 2
     run, source = open_run(tmp_path / "run"), config.data.source("train")
     written, keys = read_predictions(submission), OpenLaneV2Dataset(source).keys
     assert list(written) == keys

@@ -1,6 +1,7 @@
 """A submission holds what was detected, at the official numbers of points, and its own reader takes it."""
 
 import pickletools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,9 +12,17 @@ from tflane_jax.files.plain_pickle import load_plain_pickle
 from tflane_jax.metrics.frames import ElementDetections, LaneDetections
 from tflane_jax.metrics.segment_matching import AreaDetections, SegmentDetections
 from tflane_jax.scoring.openlane_v2 import read_predictions, read_segment_predictions
-from tflane_jax.scoring.submission import Author, centerline_record, segment_record, write_submission
+from tflane_jax.scoring.submission import (
+    Author,
+    best_lanes,
+    best_segments,
+    centerline_record,
+    segment_record,
+    write_submission,
+)
 
 KEY = FrameKey("test", "00007", "315966070559696000")
+NO_AREAS = AreaDetections([], np.zeros(0, int), np.zeros(0))
 
 
 def straight_lines(rng: np.random.Generator, lines: int, points: int) -> np.ndarray:
@@ -65,6 +74,30 @@ def test_segments_come_back(tmp_path):
         np.testing.assert_allclose(np.array(getattr(found, name)), getattr(wanted, name), atol=1e-5)
     for name in ("points", "categories", "scores"):
         np.testing.assert_allclose(np.array(getattr(found.areas, name)), getattr(areas, name), atol=1e-5)
+
+
+@pytest.mark.parametrize(("lanes", "elements"), [(2, 1), (0, 0), (9, None), (None, 2)])
+def test_the_best_lanes_and_elements_keep_order_and_relations(lanes, elements):
+    found = detections(5, 11)
+    kept = best_lanes(found, lanes, elements)
+    rows = np.sort(np.argsort(-found.scores)[:lanes])
+    columns = np.sort(np.argsort(-found.elements.scores)[:elements])
+    np.testing.assert_array_equal(np.reshape(kept.points, (-1, 11, 3)), found.points[rows])
+    np.testing.assert_array_equal(kept.scores, found.scores[rows])
+    np.testing.assert_array_equal(kept.successor, found.successor[rows][:, rows])
+    np.testing.assert_array_equal(kept.elements.boxes, found.elements.boxes[columns])
+    np.testing.assert_array_equal(kept.elements.lane, found.elements.lane[rows][:, columns])
+    segments = SegmentDetections(found, found.points + 1.0, found.points - 1.0, NO_AREAS, np.arange(5))
+    few = best_segments(segments, lanes, elements)
+    np.testing.assert_array_equal(few.lanes.scores, kept.scores)
+    np.testing.assert_array_equal(np.reshape(few.right, (-1, 11, 3)), found.points[rows] - 1.0)
+    np.testing.assert_array_equal(few.left_type, rows)
+    assert few.right_type is None
+
+
+def test_of_equal_scores_the_first_are_kept():
+    found = replace(detections(4, 11, None), scores=np.array([0.5, 0.5, 0.9, 0.5]))
+    np.testing.assert_array_equal(np.array(best_lanes(found, 2, None).points), found.points[[0, 2]])
 
 
 def test_lines_get_the_official_number_of_points():

@@ -20,8 +20,8 @@ from tflane_jax.datasets.argoverse2_export import export_tracks
 from tflane_jax.datasets.base import DrivenDataset, Split
 from tflane_jax.datasets.nuscenes_export import export_scenes
 from tflane_jax.datasets.openlane_check import check_openlane_v2
+from tflane_jax.datasets.openlane_choice import subset_of
 from tflane_jax.datasets.openlane_export import export_openlane_v2, time_offset
-from tflane_jax.datasets.openlane_frames import subset_of
 from tflane_jax.datasets.openlane_sd_map import sd_records
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import check_folder

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -24,17 +26,29 @@ from tflane_jax.progress import progress_bar
 from tflane_jax.runs import Run
 from tflane_jax.scene import Prediction
 from tflane_jax.scoring import maptr
-from tflane_jax.scoring.submission import Author, centerline_record, segment_record, write_submission
+from tflane_jax.scoring.submission import (
+    Author,
+    best_lanes,
+    best_segments,
+    centerline_record,
+    segment_record,
+    write_submission,
+)
 from tflane_jax.startup import showing, stage
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.training.runtime import configure_jax
 
-_OF_SERVER = ("method", "authors", "email", "institution", "country", "team")
+_OF_SERVER = ("method", "authors", "email", "institution", "country", "team", "most_lanes", "most_elements")
+_LARGEST = 500e6
+"""Bytes that OpenLane-V2's server takes, as people who used it told in 2023 (its issue 26)."""
 
 
 def run(options: argparse.Namespace) -> int:
     """Predict all frames of the split and write the submission."""
     check_output(options.out)
+    for name in ("most_lanes", "most_elements"):
+        if (most := getattr(options, name)) is not None and most < 1:
+            raise UserError(f"--{name.replace('_', '-')} is {most}: expected at least 1")
     configure_jax()
     trained, rest = opened(options)
     if rest:
@@ -46,22 +60,28 @@ def run(options: argparse.Namespace) -> int:
     if options.data is None and options.root is not None:
         options.data = "nuscenes" if "lines" in predicts else "openlane-v2"
     source = source_for(trained, options)
-    if isinstance(source, OpenLaneV2Config | NuScenesConfig) and options.split is not None:
-        # Configurations evaluate on the validation split in place of the test, which has no truth.
+    # Configurations evaluate on the validation split in place of the official test, which has no truth.
+    if isinstance(source, OpenLaneV2Config):
+        source = replace(source, split=options.split or options.default_split)
+    elif isinstance(source, NuScenesConfig) and options.split is not None:
         source = replace(source, split=options.split)
     check_output(options.out, folders_of(source))
     if isinstance(source, OpenLaneV2Config):
         if not {"centerlines", "segments"} & predicts:
             raise UserError("this model predicts neither centerlines nor lane segments: OpenLane-V2 has no other task")
         dataset = OpenLaneV2Dataset(source)
-        found = {dataset.keys[i]: _record(dataset, answer) for i, answer in _answers(trained, source, len(dataset))}
+        most = options.most_lanes, options.most_elements
+        answers = _answers(trained, source, len(dataset))
+        found = {dataset.keys[i]: _record(dataset, answer, *most) for i, answer in answers}
         author = Author(
             options.method, tuple(options.authors), options.email, options.institution, options.country, options.team
         )
-        write_submission(options.out, found, author)
+        _tell_size(write_submission(options.out, found, author))
     elif isinstance(source, NuScenesConfig):
         if given := [name for name in _OF_SERVER if getattr(options, name)]:
-            raise UserError(f"--{given[0]} is for OpenLane-V2's server: MapTR's file has no place for it, leave it out")
+            raise UserError(
+                f"--{given[0].replace('_', '-')} is for OpenLane-V2's server: MapTR's file has no place for it"
+            )
         if "lines" not in predicts:
             raise UserError("MapTR's file for nuScenes holds lines of a vector map, and this model predicts none")
         dataset = NuScenesDataset(source)
@@ -106,14 +126,23 @@ def _map_frames(dataset: NuScenesDataset, answers: Iterator[tuple[int, Predictio
     return [(token, found) for _, token, found in sorted(frames, key=lambda frame: frame[0])]
 
 
-def _record(dataset: OpenLaneV2Dataset, answer: Prediction) -> dict[str, Any]:
-    """Return the predictions of a frame; a model of both kinds of lanes submits its segments."""
+def _tell_size(path: Path) -> None:
+    if (size := path.stat().st_size) > _LARGEST:
+        print(
+            f"{path} has {size / 1e6:.0f} MB: OpenLane-V2's server was reported to refuse more than "
+            f"{_LARGEST / 1e6:.0f}; --most-lanes and --most-elements keep the best of each frame",
+            file=sys.stderr,
+        )
+
+
+def _record(dataset: OpenLaneV2Dataset, answer: Prediction, lanes: int | None, most: int | None) -> dict[str, Any]:
+    """Return the best predictions of a frame; a model of both kinds of lanes submits its segments."""
     elements = answer.elements
     if elements is not None:
         boxes = dataset.in_files(np.asarray(elements.box))
         elements = elements.replace(box=boxes)  # pyright: ignore[reportAttributeAccessIssue]
     if answer.segments is not None:
         crossings = "sides" if answer.segments.areas is None else "ring"
-        return segment_record(detections_of_segments(answer.segments, elements), crossings)
+        return segment_record(best_segments(detections_of_segments(answer.segments, elements), lanes, most), crossings)
     assert answer.centerlines is not None
-    return centerline_record(detections_of_centerlines(answer.centerlines, elements))
+    return centerline_record(best_lanes(detections_of_centerlines(answer.centerlines, elements), lanes, most))

@@ -110,6 +110,8 @@ class DataSource(Generic[ConfigT]):
             without data.
         content: config -> hash of the files of its examples, so that scores are not taken for those of files that were
             edited; "" where there are none, or too many to read.
+        unlabelled: config -> why its examples have no truth, so that nothing can learn from them or be scored by them;
+            "" if they have, or where only reading them tells.
     """
 
     name: str
@@ -135,6 +137,7 @@ class DataSource(Generic[ConfigT]):
     cameras: Callable[[ConfigT], tuple[str, ...] | None] = lambda config: None
     tracks_hz: Callable[[ConfigT], float | None] = lambda config: None
     content: Callable[[ConfigT], str] = lambda config: ""
+    unlabelled: Callable[[ConfigT], str] = lambda config: ""
 
 
 def split_config(config: type[ConfigT], data: Any, **own: Any) -> ConfigT:

@@ -86,7 +86,8 @@ def check_openlane_v2(
     Raises UserError where there is no frame at all, or `tracks` holds no log.
     """
     root, faults, skipped = Path(root), [], []
-    named, on_disk = named_frames(root, faults), frames_on_disk(root, skipped)
+    on_disk = frames_on_disk(root, skipped)
+    named = named_frames(root, on_disk, faults, skipped)
     if not any(on_disk.values()):
         raise UserError(f"{root} holds no <split>/<segment>/info/<timestamp>.json: is it OpenLane-V2's folder?")
     subsets = subsets_of(root, on_disk)
@@ -115,7 +116,7 @@ def check_openlane_v2(
             counts = _check_frames(root, there, subset, logs, CameraChecks(images), cameras, faults, progress)
             # What makes a file unreadable has been reported.
             faults += [why for path, why in unnamed.items() if not any(str(path) in fault for fault in faults[found:])]
-            counts["segments"] = len({key.segment for key in keys})
+            counts["segments"] = len({key.segment for key in there})
             counts["SD maps"] = _check_sd_maps(root, there, faults)
             content = counts if tracks is None else _with_share(counts)
             lacking = Counter() if logs is None else logs.lacking(there)

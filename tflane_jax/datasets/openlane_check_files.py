@@ -18,13 +18,23 @@ from tflane_jax.files.openlane import FrameKey, frames_of
 _TRIED = 3
 _FRAME_FILE = re.compile(r"(\d+)(-ls)?\.json")
 _IMAGES = (".jpg", ".jpeg", ".png")
+# Beside the splits in the official repository's folder.
+_OFFICIAL = ("openlanev2.md5", "preprocess.py", "preprocess-ls.py", "preprocess-sd.py")
 _CAMERAS = {name for subset in SUBSETS.values() for name in subset.cameras}
 
 
-def named_frames(root: Path, faults: list[str]) -> dict[Split, list[FrameKey]]:
-    """Return the frames that any split file names."""
-    named: dict[Split, list[FrameKey]] = {split: [] for split in SPLITS}
+def named_frames(
+    root: Path, on_disk: Mapping[Split, list[FrameKey]], faults: list[str], skipped: list[str]
+) -> dict[Split, list[FrameKey]]:
+    """Return the frames that any split file names, of those files that name a frame on disk.
+
+    The official folder has the files of both subsets, and many people one subset. A file none of whose frames are there
+    is skipped and named, unless no file has any.
+    """
+    by_file: dict[Path, dict[Split, list[FrameKey]]] = {}
     for file in sorted(root.glob("data_dict_*.json")):
+        named: dict[Split, list[FrameKey]] = {split: [] for split in SPLITS}
+        by_file[file] = named
         try:
             content = load_json(file)
             for split in SPLITS:
@@ -39,7 +49,12 @@ def named_frames(root: Path, faults: list[str]) -> dict[Split, list[FrameKey]]:
                 named[split] += [key for key in keys if is_time(key.timestamp)]
         except UserError as error:
             faults.append(str(error))
-    return named
+    there = {key for keys in on_disk.values() for key in keys}
+    used = [file for file, named in by_file.items() if any(there.intersection(keys) for keys in named.values())]
+    for file, named in by_file.items():
+        if used and file not in used and (frames := sum(map(len, named.values()))):
+            skipped.append(f"{file}: none of its {frames} frames are here")
+    return {split: [key for file in used or by_file for key in by_file[file][split]] for split in SPLITS}
 
 
 def frames_on_disk(root: Path, skipped: list[str]) -> dict[Split, list[FrameKey]]:
@@ -76,7 +91,7 @@ def frames_on_disk(root: Path, skipped: list[str]) -> dict[Split, list[FrameKey]
 def _of_root(path: Path) -> bool:
     if path.name in SPLITS:
         return path.is_dir()
-    return path.is_file() and (path.match("data_dict_*.json") or path.suffix == ".pkl")
+    return path.is_file() and (path.match("data_dict_*.json") or path.suffix == ".pkl" or path.name in _OFFICIAL)
 
 
 def _strays_of_images(folder: Path) -> Iterator[str]:

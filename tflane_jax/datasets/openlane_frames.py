@@ -115,12 +115,6 @@ class FrameFile:
     annotation: Any | None
 
 
-def subset_of(root: Path) -> SubsetName:
-    """Return the subset of the split file in a folder; A if there is none or both."""
-    has = {name: (root / subset.data_dict).is_file() for name, subset in SUBSETS.items()}
-    return "B" if has["B"] and not has["A"] else "A"
-
-
 def info_path(root: Path, key: FrameKey, suffix: str = "") -> Path:
     """Return the file of a frame; `suffix` is `files.openlane.FieldNames.suffix`."""
     return root / key.split / key.segment / "info" / f"{key.timestamp}{suffix}.json"

@@ -8,103 +8,45 @@ virtual markers (`openlane_markers`) and the official SD map (`openlane_sd_map`)
 
 from __future__ import annotations
 
-from dataclasses import KW_ONLY, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import takewhile
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
 
-from tflane_jax.datasets.base import ExampleConfig, FrameInfo, Split
+from tflane_jax.datasets.base import FrameInfo, Split
 from tflane_jax.datasets.data_source import Choice, DataSource, FolderCheck, split_config
 from tflane_jax.datasets.openlane_annotation import read_annotation
-from tflane_jax.datasets.openlane_can_bus import CanBus, vehicle_state
+from tflane_jax.datasets.openlane_can_bus import vehicle_state
 from tflane_jax.datasets.openlane_check import check_openlane_v2
 from tflane_jax.datasets.openlane_check_cameras import Images
+from tflane_jax.datasets.openlane_choice import preset_of, subset_of
 from tflane_jax.datasets.openlane_example import area_set, blank, camera_views, element_set, empty_views, lane_graph
 from tflane_jax.datasets.openlane_frames import (
     SUBSETS,
     FrameFile,
-    SubsetName,
     frames_content,
     info_path,
     list_frames,
     read_frame,
     read_pose,
     source_logs,
-    subset_of,
     without_map_changes,
 )
-from tflane_jax.datasets.openlane_markers import BoardsConfig, SegmentBoards, SegmentFrame, segment_frame
+from tflane_jax.datasets.openlane_markers import SegmentBoards, SegmentFrame, segment_frame
 from tflane_jax.datasets.openlane_sd_map import SegmentSdMaps
-from tflane_jax.datasets.openlane_tracks import SourceTracks, WithoutTracks
+from tflane_jax.datasets.openlane_settings import OpenLaneV2Config, OpenLaneV2Settings
+from tflane_jax.datasets.openlane_tracks import SourceTracks
 from tflane_jax.datasets.overlap import frame_drives
 from tflane_jax.datasets.photometric import PhotometricConfig
-from tflane_jax.datasets.streaming import StreamingConfig
-from tflane_jax.datasets.view_images import TOPONET_SUBSET_A, TOPONET_SUBSET_B, ImageConfig, ImageFit, fit_image
+from tflane_jax.datasets.view_images import TOPONET_SUBSET_A, ImageConfig, ImageFit, fit_image
 from tflane_jax.errors import UserError
 from tflane_jax.files.images import read_image
 from tflane_jax.files.openlane import CENTERLINE, SEGMENT
 from tflane_jax.geometry import relative_pose
 from tflane_jax.scene import CameraViews, Example
-
-Flavour = Literal["centerline", "lane_segment", "both"]
-OPENLANE_V2_SIZES = ExampleConfig(lanes=128, segments=192, areas=64, elements=48)
-"""Capacities of an example; a frame of subset A has about 60 centerlines, 75 lane segments and 11 elements."""
-
-
-@dataclass(frozen=True)
-class OpenLaneV2Settings:
-    """How frames become examples: the settings of one split and of a run have these in common.
-
-    Attributes:
-        root: folder of the dataset.
-        subset: A is from Argoverse 2 (7 cameras), B from nuScenes (6 cameras).
-        flavour: which files are read: "centerline" (`Example.lanes`), "lane_segment" (`Example.segments` and areas), or
-            "both". Traffic elements come from the centerline files if these are read, and then tell which centerlines
-            they govern (`TrafficElements.lane`), with "lane_segment" which segments.
-        data_dict: split file under `root`, see `openlane_frames.list_frames`.
-        image: scaling and cropping of the images; None does not read them (`Example.cameras` is None, boxes are in
-            pixels of the files).
-        example: capacities and points; what does not fit is left out, farthest first, with a `TruncationWarning`.
-        loading: memory or disk, and workers; no example depends on it.
-        map_changes: "drop" leaves out the logs whose streets differ from their map, see `openlane_frames.MAP_CHANGES`.
-        tracks: folder of the Argoverse 2 logs from which subset A was made, or of nuScenes for B; their boxes become
-            the traffic flow, as many frames and at the rate that `example.history` and `example.history_hz` say. None:
-            no traffic flow.
-        without_tracks: what becomes of frames whose log is not there, see `openlane_tracks.WithoutTracks`.
-        boards: virtual markers, where `example.markers` asks for the prior; the official test split, which has no
-            lanes, gets none. `example.sd_map` asks for the official SD map.
-        can_bus: "reference": images come with the numbers of the pose that published weights read
-            (`openlane_can_bus`, `BevFormerConfig.motion`).
-    """
-
-    root: Path
-    _: KW_ONLY
-    subset: SubsetName = "A"
-    flavour: Flavour = "centerline"
-    data_dict: str | None = None
-    image: ImageConfig | None = TOPONET_SUBSET_A
-    example: ExampleConfig = OPENLANE_V2_SIZES
-    loading: StreamingConfig = StreamingConfig()
-    map_changes: Literal["keep", "drop"] = "keep"
-    tracks: Path | None = None
-    without_tracks: WithoutTracks = "refuse"
-    boards: BoardsConfig = BoardsConfig()
-    can_bus: CanBus = "none"
-
-
-@dataclass(frozen=True)
-class OpenLaneV2Config(OpenLaneV2Settings):
-    """One split.
-
-    Attributes:
-        split: the official test split has no annotations, so its examples have no valid lane.
-    """
-
-    split: Split = "train"
 
 
 class OpenLaneV2Dataset:
@@ -149,6 +91,8 @@ class OpenLaneV2Dataset:
     def example(self, index: int) -> Example:
         """Return one frame."""
         config, key, files = self.config.example, self.keys[self._checked(index)], self._files(index)
+        if (bare := [file.path for file in files if file.annotation is None]) and key.split != "test":
+            raise UserError(f"{bare[0]} has no annotation: of the splits, only test may have such frames")
         annotations = [
             None if file.annotation is None else read_annotation(file.annotation, names, f"{file.path}: annotation")
             for file, names in zip(files, self._names, strict=True)
@@ -184,6 +128,11 @@ class OpenLaneV2Dataset:
             has_previous=np.asarray(before),
             cameras=self._views(files[0]),
         )
+
+    def first_unlabelled(self) -> Path | None:
+        """Return the first frame's file if it has no annotation."""
+        file = self._files(0)[0]
+        return None if file.annotation is not None else file.path
 
     def info(self, index: int) -> FrameInfo:
         """Return segment, time and pose of one frame, and its city, which only the source logs tell."""
@@ -318,8 +267,15 @@ def _choose(choice: Choice) -> OpenLaneV2Config:
     if isinstance(choice.configured, OpenLaneV2Config):  # its splits stay as configured: the official test has no truth
         return replace(choice.configured, root=choice.root)
     subset = subset_of(choice.root)
-    image = TOPONET_SUBSET_A if subset == "A" else TOPONET_SUBSET_B
+    image = preset_of(choice.root, choice.split, subset)
     return OpenLaneV2Config(choice.root, choice.split, subset=subset, image=image, example=choice.configured.example)
+
+
+def _unlabelled(config: OpenLaneV2Config) -> str:
+    """Return why a split has no truth; a frame of another split that has none is an error when it is read."""
+    if config.split != "test" or (found := OpenLaneV2Dataset(config).first_unlabelled()) is None:
+        return ""
+    return f"{found} has no annotation, as the official test split has none: name train or val in its place"
 
 
 def _check(root: Path, tracks: Path | None = None, images: Images = "ends") -> FolderCheck:
@@ -343,6 +299,7 @@ SOURCE = DataSource(
     tracks=True,
     interval=lambda config: 0.5,
     cameras=lambda config: None if config.image is None else SUBSETS[config.subset].cameras,
+    unlabelled=_unlabelled,
     tracks_hz=lambda config: 0.0 if config.tracks is None else SUBSETS[config.subset].tracks_hz,
     content=lambda config: frames_content(Path(config.root), config.split, config.subset, config.data_dict),
 )

@@ -18,6 +18,7 @@ from tflane_jax.datasets.argoverse2_log import city_of, find_logs, read_poses
 from tflane_jax.datasets.base import IndexedExamples
 from tflane_jax.errors import UserError
 from tflane_jax.files.fields import load_members, member, numbers
+from tflane_jax.files.openlane import info_files
 
 RADII = (5.0, 10.0, 20.0, 50.0)
 NEAR = 5.0
@@ -52,7 +53,7 @@ def read_drives(root: Path) -> list[DrivenPath]:
     """
     root = Path(root)
     # Where a frame has both files, which hold the same pose, the one without "-ls" is read: it sorts last.
-    files = sorted(root.glob("**/info/*.json"))
+    files = sorted(info_files(root))
     if frames := {file.with_stem(file.stem.removesuffix("-ls")): file for file in files}:
         drives: dict[Path, list[np.ndarray]] = {}
         for _, file in sorted(frames.items()):

@@ -126,6 +126,12 @@ def load(config: Any, *, progress: bool = True, parts: Collection[str] = TRAININ
     return source.load(open_dataset(config, progress=progress), progress, parts, loading)
 
 
+def check_labelled(config: Any, what: str) -> None:
+    """Raise UserError, which names what the examples are for, where it is known that they have no truth."""
+    if why := source_of(config).unlabelled(config):
+        raise UserError(f"{what} needs truth: {why}")
+
+
 def sample(config: Any) -> Any:
     """Return one example with the shapes and types of all, without building a cache and, if possible, without data."""
     source = source_of(config)

@@ -6,7 +6,9 @@ docs/reference/data_formats.md, section 2.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import os
+from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -54,6 +56,26 @@ class FrameKey(NamedTuple):
     def scene(self) -> str:
         """The drive to which the frame belongs."""
         return f"{self.split}/{self.segment}"
+
+
+def info_files(folder: Path, above: tuple[str, ...] = ()) -> Iterator[Path]:
+    """Yield the frames' files, `.../info/*.json`, at any depth below a folder; links are followed, as `**` does not.
+
+    Args:
+        folder: where to look, not in folders of images.
+        above: real paths of the folders that were passed on the way, to none of which a link may lead back.
+    """
+    if folder.name == "info":
+        yield from folder.glob("*.json")
+    try:
+        real = os.path.realpath(folder)
+        with os.scandir(folder) as entries:
+            below = sorted(entry.name for entry in entries if entry.name != "image" and entry.is_dir())
+    except OSError:  # it may not be read, or is gone
+        return
+    if real not in above:
+        for name in below:
+            yield from info_files(folder / name, (*above, real))
 
 
 def frames_of(content: Any, split: str, where: str) -> list[FrameKey]:

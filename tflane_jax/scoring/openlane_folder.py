@@ -10,7 +10,7 @@ from pathlib import Path
 
 from tflane_jax.errors import UserError
 from tflane_jax.files.fields import load_json
-from tflane_jax.files.openlane import DATA_DICT, FieldNames, FrameKey, frames_of
+from tflane_jax.files.openlane import DATA_DICT, FieldNames, FrameKey, frames_of, info_files
 from tflane_jax.files.wording import named
 
 
@@ -54,20 +54,26 @@ def annotation_files(
 def _below(folder: Path, splits: Collection[str]) -> list[Path]:
     """Return the annotations of some splits (none: of all) in the dataset's folder, or in that of one split."""
     if not splits:
-        return sorted(folder.glob("**/info/*.json"))
+        return sorted(info_files(folder))
     # Not `folder / split`: that name comes from the predictions, and "/" is one.
     below = [found for found in folder.iterdir() if found.name in splits and found.is_dir()] or [folder]
-    files = (file for each in below for file in each.glob("**/info/*.json"))
+    files = (file for each in below for file in info_files(each))
     return sorted(file for file in files if file.parent.parent.parent.name in splits)
 
 
 def _subset(folder: Path, predicted: Collection[FrameKey]) -> set[FrameKey] | None:
-    """Return the frames of the subset that is predicted; None where several are, or where no split file tells."""
+    """Return the frames of the split file that is predicted; None where none tells.
+
+    It is the one that names the predicted frames and no others, such as an own file; else the only official one that
+    names any of their segments.
+    """
     scenes, splits, subsets = {key.scene for key in predicted}, {key.split for key in predicted}, []
-    for file in (file for each in (folder, folder.parent) for file in sorted(each.glob(f"{DATA_DICT}*.json"))):
+    for file in (file for each in (folder, folder.parent) for file in sorted(each.glob("data_dict_*.json"))):
         content = load_json(file)
         there = [split for split in sorted(splits) if isinstance(content, Mapping) and split in content]
         frames = {key for split in there for key in frames_of(content, split, str(file))}
-        if scenes & {key.scene for key in frames}:
+        if frames and frames == set(predicted):
+            return frames
+        if file.name.startswith(DATA_DICT) and scenes & {key.scene for key in frames}:
             subsets.append(frames)
     return subsets[0] if len(subsets) == 1 else None

@@ -112,11 +112,21 @@ def _annotations(
             unit="frame",
             disable=not progress,
         )
-        return {key: parse(member(load_file(file), "annotation", str(file)), str(file), True) for key, file in files}
+        return {key: parse(_annotation(load_file(file), file), str(file), True) for key, file in files}
     collected = load_file(path)
     if not isinstance(collected, Mapping):
         raise UserError(f"{path} is of type {type(collected).__name__}, expected a mapping from frames")
     return _by_frame(collected, "annotation", path, lambda record, where: parse(record, where, False))
+
+
+def _annotation(content: Any, file: Path) -> Any:
+    """Return the annotation in a frame's file; raise UserError where there is none, as in the official test split."""
+    if isinstance(content, Mapping) and content.get("annotation") is None:
+        raise UserError(
+            f"{file} has no annotation: that of the official test split is not public. Score predictions of val, or "
+            "upload these"
+        )
+    return member(content, "annotation", str(file))
 
 
 def _by_frame(records: Mapping[Any, Any], field: str, path: Path, parse: _Parse[T]) -> dict[FrameKey, T]:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from tflane_jax.errors import UserError
+from tflane_jax.files.openlane import info_files
 from tflane_jax.files.plain_pickle import load_plain_pickle
 
 Side = Literal["predictions", "ground truth"]
@@ -82,7 +83,7 @@ def recognise(path: Path) -> Content | None:
 
 
 def _of_folder(path: Path) -> Content | None:
-    stems = [file.stem for file in path.glob("**/info/*.json")]
+    stems = [file.stem for file in info_files(path)]
     if not stems:
         return None
     segments = all(stem.endswith("-ls") for stem in stems)

@@ -10,12 +10,12 @@ from __future__ import annotations
 
 import pickle
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from tflane_jax.files.atomic import replacing
 from tflane_jax.files.openlane import CENTERLINE, SEGMENT, FieldNames, FrameKey
@@ -82,6 +82,45 @@ def segment_record(found: SegmentDetections, crossings: Literal["ring", "sides"]
             for i, (points, category, score) in enumerate(areas, _AREAS)
         ]
     }
+
+
+def best_lanes(found: LaneDetections, lanes: int | None, elements: int | None) -> LaneDetections:
+    """Return the lanes and the traffic elements of the highest scores, in their order, with their relations.
+
+    Args:
+        found: detections.
+        lanes, elements: how many; None for all.
+    """
+    return _selected(found, _best(found.scores, lanes), elements)
+
+
+def best_segments(found: SegmentDetections, lanes: int | None, elements: int | None) -> SegmentDetections:
+    """Return the segments and the traffic elements of the highest scores like `best_lanes`, and all areas."""
+    rows = _best(found.lanes.scores, lanes)
+    left_type, right_type = (None if kinds is None else kinds[rows] for kinds in (found.left_type, found.right_type))
+    return replace(
+        found,
+        lanes=_selected(found.lanes, rows, elements),
+        left=[found.left[i] for i in rows],
+        right=[found.right[i] for i in rows],
+        left_type=left_type,
+        right_type=right_type,
+    )
+
+
+def _best(scores: Float[np.ndarray, " n"], most: int | None) -> Int[np.ndarray, " m"]:
+    """Return the numbers of the `most` highest scores, ascending; of equal ones the first."""
+    return np.sort(np.argsort(-np.asarray(scores), kind="stable")[:most])
+
+
+def _selected(found: LaneDetections, rows: Int[np.ndarray, " m"], elements: int | None) -> LaneDetections:
+    there = found.elements
+    if there is not None:
+        columns = _best(there.scores, elements)
+        lane = there.lane[np.ix_(rows, columns)]
+        there = ElementDetections(there.boxes[columns], there.attributes[columns], there.scores[columns], lane)
+    points = [found.points[i] for i in rows]
+    return LaneDetections(points, found.scores[rows], found.successor[np.ix_(rows, rows)], there)
 
 
 def write_submission(path: Path, records: Mapping[FrameKey, Mapping[str, Any]], author: Author) -> Path:

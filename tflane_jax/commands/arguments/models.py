@@ -126,10 +126,17 @@ def submit(commands) -> None:
         function="run",
     )
     model_arguments(parser)
-    split_arguments(parser, "test")
+    split_arguments(parser, "test", ", the official one; for nuScenes, what the configuration tests on")
     parser.add_argument(
         "--out", metavar="FILE", type=Path, required=True, help="a pickle, or MapTR's nuscmap_results.json"
     )
+    for name, what in (("lanes", "lanes"), ("elements", "traffic elements")):
+        parser.add_argument(
+            f"--most-{name}",
+            type=int,
+            metavar="N",
+            help=f"OpenLane-V2: only the N {what} of the highest scores in each frame, for a smaller file",
+        )
     about = parser.add_argument_group("what OpenLane-V2's server asks for; not needed to score the file yourself")
     about.add_argument("--method", default="", help="name of the method")
     about.add_argument("--authors", nargs="+", default=[], metavar="NAME", help="names of the authors")

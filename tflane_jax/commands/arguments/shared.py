@@ -117,10 +117,10 @@ def example_arguments(parser: argparse.ArgumentParser, split: str) -> None:
     parser.add_argument("--max-instances", type=int, metavar="N", help="use at most N road users; 0: no traffic flow")
 
 
-def split_arguments(parser: argparse.ArgumentParser, split: str) -> None:
-    """Add the arguments that select one split of the data; `split` is the default."""
+def split_arguments(parser: argparse.ArgumentParser, split: str, further: str = "") -> None:
+    """Add the arguments that select one split of the data; `split` is the default, `further` ends what help says."""
     # No argparse default: an explicit --split is an error for data without splits, the default split is not.
-    parser.add_argument("--split", choices=("train", "val", "test"), help=f"default {split}")
+    parser.add_argument("--split", choices=("train", "val", "test"), help=f"default {split}{further}")
     parser.set_defaults(default_split=split)
     source_arguments(parser)
 

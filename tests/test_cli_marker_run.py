@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from tests.markers.test_detection import AHEAD, pose
-from tests.markers.test_reader import BOARDS, LANES, SECOND, STORE, ego, seen_from
+from tests.markers.test_reader import BOARDS, LANES, SECOND, ego, seen_from
 from tests.tasks.test_marker_drive import Remembering
 from tflane_jax.cli import main
 from tflane_jax.commands import marker_run
@@ -102,7 +102,7 @@ def test_a_drive_from_pixels_to_lanes(drive, tmp_path, capsys):
     assert {board["id"]: board["outcome"] for board in last["boards"]} == {8: "stale", 40: "unknown"}
     assert all("confidence" not in board for board in last["boards"])
     row = [cell.strip() for cell in capsys.readouterr().out.splitlines()[4].split("|")[1:-1]]
-    assert row == ["4", "4", "2", "2", "1", "1", "0", "0", "0"]
+    assert row == ["4", "4", "2", "2", "1", "1", "0", "0", "0", "0"]
     assert first["guidance"]
 
 
@@ -118,7 +118,7 @@ def test_both_boards_of_one_id_are_counted_and_recorded(drive, tmp_path, capsys)
     middles = sorted(np.mean(board["corners"], 0)[0] for board in boards)
     assert middles[0] < 480 < middles[1]
     row = [cell.strip() for cell in capsys.readouterr().out.splitlines()[4].split("|")[1:-1]]
-    assert row[3:] == ["1", "1", "1", "2", "0", "0"]
+    assert row[3:] == ["1", "1", "1", "2", "0", "0", "0"]
 
 
 @pytest.mark.parametrize(
@@ -180,17 +180,8 @@ def test_a_board_without_lanes_is_not_used(drive, tmp_path, capsys):
     assert board["outcome"] == "no lanes"
     assert "confidence" not in board
     row = [cell.strip() for cell in capsys.readouterr().out.splitlines()[4].split("|")[1:-1]]
-    assert row[-1] == "2"
+    assert row[-2] == "2"
     assert row[3] == "0"
-
-
-def test_the_rendered_store_has_the_day_of_its_survey(tmp_path, monkeypatch):
-    monkeypatch.setattr(marker_run, "render_cameras", lambda *_: pytest.fail("drawn"))
-    written = []
-    monkeypatch.setattr(marker_run, "store_of_log", lambda log, **options: written.append(options) or STORE)
-    with pytest.raises(pytest.fail.Exception, match="drawn"):
-        main(["markers", "render", "--log", "200000005", "--surveyed", "2026-01-15", "--out", str(tmp_path / "town")])
-    assert written[0]["surveyed"] == datetime.date(2026, 1, 15)
 
 
 def test_any_number_of_days_is_an_age():
@@ -259,33 +250,6 @@ def test_the_rate_of_frames_counts_for_models_with_memory_alone(drive, tmp_path,
     assert [each.category for each in found] == [FrameRateWarning] * streams
 
 
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        (["--log", "-1"], "--log"),
-        (["--cameras", "0"], "--cameras is 1 to 7"),
-        (["--cameras", "-1"], "--cameras is 1 to 7"),
-        (["--cameras", "7", "--ring", "nuscenes"], "--cameras is 1 to 6, the cameras of --ring nuscenes"),
-        (["--frames", "0"], "--frames must be from 1"),
-        (["--frames", "100000000000000"], "--frames must be from 1"),
-        (["--surveyed", "soon"], "--surveyed soon is no day"),
-        (["--scale", "50"], "--scale is 50.0: it must be so small that images have at most 8192 pixels"),
-    ],
-)
-def test_render_refuses_what_it_cannot_draw(tmp_path, capsys, change, words):
-    arguments = ["markers", "render", "--log", "1", "--out", str(tmp_path / "out"), *change]
-    assert main(arguments) == 2
-    assert words in capsys.readouterr().err
-    assert not (tmp_path / "out").exists()
-
-
-def test_two_drives_do_not_share_a_folder(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(marker_run, "simulate", lambda *_: pytest.fail("simulated"))
-    (tmp_path / "images").mkdir()
-    assert main(["markers", "render", "--log", "1", "--out", str(tmp_path)]) == 2
-    assert "is not empty: choose another folder" in capsys.readouterr().err
-
-
 def test_frames_before_an_error_are_kept(drive, tmp_path, monkeypatch):
     drawn = marker_run.save_drive_frame
 
@@ -299,3 +263,45 @@ def test_frames_before_an_error_are_kept(drive, tmp_path, monkeypatch):
     written = json.loads((tmp_path / "out" / "frames.json").read_text())
     assert not written["complete"]
     assert [frame["picture"] for frame in written["frames"]] == ["000.png", "001.png"]
+
+
+def test_lanes_that_the_prior_does_not_take_are_counted(drive, tmp_path, capsys):
+    """The board of the first two frames has 40 lanes side by side, the prior of a model without markers takes 32."""
+    content = json.loads((drive / "store.json").read_text())
+    (entry,) = [entry for entry in content["markers"] if entry["id"] == 3]
+    lane = np.array(entry["lanes"][0])
+    entry["lanes"] = [(lane + 0.05 * number * np.array([0.0, 0.0, 1.0])).tolist() for number in range(40)]
+    entry["successor"] = []
+    (tmp_path / "store.json").write_text(json.dumps(content))
+    out = tmp_path / "out"
+    assert main(arguments(drive, out, store=tmp_path / "store.json")) == 0
+    frames = json.loads((out / "frames.json").read_text())["frames"]
+    assert [frame["lanes_dropped"] for frame in frames] == [8, 8, 0, 0]
+    assert len(frames[0]["guidance"]) == 32
+    row = [cell.strip() for cell in capsys.readouterr().out.splitlines()[4].split("|")[1:-1]]
+    assert row[-1] == "16"
+
+
+def test_pictures_of_an_earlier_drive_do_not_stay(drive, tmp_path):
+    out, poses = tmp_path / "out", tmp_path / "poses.json"
+    assert main(arguments(drive, out)) == 0
+    (out / "own.png").write_bytes(b"")
+    content = json.loads((drive / "poses.json").read_text())
+    poses.write_text(json.dumps(content | {"frames": content["frames"][:2]}))
+    assert main(arguments(drive, out, poses=poses)) == 0
+    assert sorted(path.name for path in out.iterdir()) == ["000.png", "001.png", "frames.json", "own.png"]
+
+
+def test_a_drive_without_images_is_refused_and_a_camera_without_any_is_told(drive, tmp_path, capsys):
+    content = json.loads((drive / "poses.json").read_text())
+    poses = tmp_path / "poses.json"
+    content["cameras"].append(content["cameras"][0] | {"name": "rear"})
+    poses.write_text(json.dumps(content))
+    assert main(arguments(drive, tmp_path / "one", poses=poses)) == 0
+    assert "warning: " + f"{poses}: no frame has an image of rear" in capsys.readouterr().err
+    for frame in content["frames"]:
+        frame["images"] = {}
+    poses.write_text(json.dumps(content))
+    assert main(arguments(drive, tmp_path / "none", poses=poses)) == 2
+    assert f"{poses}: no frame names an image" in capsys.readouterr().err
+    assert not (tmp_path / "none").exists()

@@ -9,7 +9,7 @@ import pytest
 
 from tests.markers.test_detection import AHEAD, photo, pose, views
 from tflane_jax.datasets.base import ExampleConfig
-from tflane_jax.datasets.native_views import fitted_views
+from tflane_jax.datasets.native_views import CameraNamesWarning, camera_names, check_camera_names, fitted_views
 from tflane_jax.datasets.openlane_v2 import OpenLaneV2Config
 from tflane_jax.datasets.procedural import ProceduralConfig
 from tflane_jax.datasets.view_images import ImageConfig, fit_image
@@ -110,3 +110,27 @@ def test_a_camera_whose_images_do_not_fit_is_refused_before_it_has_one(native):
     absent = native.replace(valid=np.array([False]), size=np.array([[960, 700]]))
     with pytest.raises(UserError, match="images of camera front are 960 x 700 pixels, which does not fit"):
         fitted_views(absent, world(MOUNT, scale=0.25))
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        world(MOUNT, replace(MOUNT, name="left"), replace(MOUNT, name="right")),
+        OpenLaneV2Config(Path("nowhere"), subset="B"),
+    ],
+)
+def test_cameras_in_another_order_are_refused(source):
+    """They would be taken for each other without a word."""
+    names = camera_names(source)
+    assert len(names) == (3 if "left" in names else 6)
+    check_camera_names(names, source)
+    check_camera_names(names[:-1], source)  # their number is an error of the images
+    swapped = (names[0], names[2], names[1], *names[3:])
+    with pytest.raises(UserError, match=f"the drive has the cameras {names[0]}, {names[2]}.* give them in this order"):
+        check_camera_names(swapped, source)
+    with pytest.warns(CameraNamesWarning, match=f"cameras a, .* are taken for the model's {names[0]}"):
+        check_camera_names(("a", *names[1:]), source)
+
+
+def test_a_model_of_evidence_has_no_cameras():
+    assert camera_names(ProceduralConfig()) == ()

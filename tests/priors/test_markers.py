@@ -137,3 +137,19 @@ def test_the_confidence_of_a_marker_is_that_of_its_lanes(changed):
 def test_too_few_points_are_refused():
     with pytest.raises(ValueError, match="asks for 11"):
         select_marker_lanes(observations(), MarkerPriorConfig())
+
+
+def test_of_lanes_that_are_trusted_alike_the_nearest_are_kept():
+    """One board with five lanes side by side, of which the last in the store is the nearest to the vehicle."""
+    empty = MarkerObservations.empty(2, 5, 3)
+    lanes = np.zeros((2, 5, 3, 3), np.float32)
+    lanes[0, :, :, 0], lanes[0, :, :, 1] = [1.0, 5.0, 9.0], np.array([8.0, 6.0, -4.0, -7.0, 1.0])[:, None]
+    lane_valid = np.zeros((2, 5), bool)
+    lane_valid[0] = True
+    lanes[1] = np.nan
+    markers = empty.replace(lanes=lanes, lane_valid=lane_valid, valid=np.array([True, False]), score=np.ones(2))
+    for count, kept in ((3, [1.0, -4.0, 6.0]), (5, [8.0, 6.0, -4.0, -7.0, 1.0])):
+        for select in (select_marker_lanes, jax.jit(select_marker_lanes, static_argnums=1)):
+            found = select(markers, MarkerPriorConfig(lanes=count, points=3))
+            assert found.valid.all()
+            np.testing.assert_allclose(found.points[:, 0, 1], kept)

@@ -73,12 +73,13 @@ def test_priors_that_a_drive_lacks_are_warned_of():
     def task(**priors):
         return LaneGraphTask(replace(CAMERA_TOPONET, priors=PriorsConfig(**priors)))
 
-    check_model(task())
     check_model(task(markers=CONFIG))
+    with pytest.warns(MissingPriorWarning, match="reads no markers: .* its own lanes do not depend on them"):
+        check_model(task())
     with pytest.warns(MissingPriorWarning, match="reads an SD map, and a drive has none"):
         check_model(task(markers=CONFIG, sd_map=SMALL_SD_MAP))
     with pytest.warns(MissingPriorWarning, match="reads an SD map and traffic flow"):
-        check_model(task(sd_map=SMALL_SD_MAP, traffic_flow=TrafficFlowConfig()))
+        check_model(task(markers=CONFIG, sd_map=SMALL_SD_MAP, traffic_flow=TrafficFlowConfig()))
 
 
 @pytest.mark.slow

@@ -40,6 +40,11 @@ def test_a_run_to_start_from_without_its_settings_is_damaged(whole, tmp_path, co
         check_origins(str(tmp_path / "origin"), (0,))
 
 
+def test_no_run_is_written_with_a_capital():
+    with pytest.raises(UserError, match=r"training\.init_from is none: .*; write None to start from no run"):
+        check_origins("none", (0,))
+
+
 def test_every_seed_may_start_from_a_run_of_its_own(whole, tmp_path):
     short = dataclasses.replace(CONFIG, steps=4)
     for seed in (0, 1):

@@ -1,19 +1,19 @@
-"""`tflane markers run` and `tflane markers render`.
+"""`tflane markers run`: reads a drive (`datasets.drive_files`) and a store, writes pictures and frames.json.
 
-`run` reads a drive (`datasets.drive_files`) and a store, and writes a picture for each frame and frames.json:
-    {"store", "model", "threshold", "complete", "frames": [{"timestamp_ns", "picture", "gate", "remembered",
+frames.json:
+    {"store", "model", "threshold", "complete",
+     "frames": [{"timestamp_ns", "picture", "lanes_dropped", "gate", "remembered",
      "boards": [{"id", "outcome", "score", "size", "position", "distance", "camera", "corners", "residual",
                  "confidence"}, ...],
      "guidance": [{"weight", "points": [[x, y], ...]}, ...],
      "lanes": [{"score", "points": [[x, y, z], ...]}, ...]}, ...],
      "faults": [{"file", "error"}, ...]}
     "complete" is false if an error ended the command, and the frames are those before it.
-    "outcome" is one of `markers.observe.Outcome`; "residual" and "confidence" exist for boards that give a prior,
-    "lanes" with a model. An id that was read at two places has two entries. Coordinates are in the ego frame, metres;
-    corners of the black square are pixels of the camera's undistorted image. `faults` are images that could not be
-    read; their cameras saw nothing in that frame.
-
-`render` writes such a drive of the built-in world, with its store.
+    "lanes_dropped" counts lanes of the boards that the prior does not take. "outcome" is one of
+    `markers.observe.Outcome`; "residual" and "confidence" exist for boards that give a prior, "lanes" with a model. An
+    id that was read at two places has two entries. Coordinates are in the ego frame, metres; corners of the black
+    square are pixels of the camera's undistorted image. `faults` are images that could not be read; their cameras saw
+    nothing in that frame.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ import math
 import sys
 import warnings
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any, get_args
 
@@ -32,37 +32,28 @@ import numpy as np
 
 from tflane_jax.commands.marker_store import day_of
 from tflane_jax.commands.sources import make_folder
-from tflane_jax.datasets.drive_files import Drive, DriveCamera, DriveFrame, load_drive, save_drive, thinned
+from tflane_jax.datasets.drive_files import Drive, load_drive, thinned
 from tflane_jax.datasets.marker_cache import search_views
-from tflane_jax.datasets.marker_observations import store_of_log
-from tflane_jax.datasets.native_views import fitted_views
+from tflane_jax.datasets.native_views import check_camera_names, fitted_views
 from tflane_jax.errors import UserError
-from tflane_jax.files.atomic import check_folder, check_replaces, replacing, write_bytes, write_json
+from tflane_jax.files.atomic import check_folder, check_replaces, write_json
+from tflane_jax.files.fields import load_json
 from tflane_jax.files.images import opencv
-from tflane_jax.geometry import PerceptionRange, invert_pose
-from tflane_jax.limits import check_settings
+from tflane_jax.geometry import PerceptionRange
 from tflane_jax.markers.image_search import DetectorConfig
 from tflane_jax.markers.observe import Outcome
 from tflane_jax.markers.reader import MarkerReader, ReaderConfig
 from tflane_jax.markers.store import MarkerStore, StaleMarkerWarning, UnknownMarkerWarning
-from tflane_jax.markers.store_files import load_store, save_store
+from tflane_jax.markers.store_files import load_store
 from tflane_jax.plots import format_table
 from tflane_jax.plots.marker_drive import board_outline, frame_title, save_drive_frame
 from tflane_jax.progress import progress_bar
 from tflane_jax.runs import open_run
 from tflane_jax.scene import CameraViews
-from tflane_jax.scene.logs import Log
 from tflane_jax.scene.marker_patterns import MarkerFamily, marker_count
 from tflane_jax.tasks.lane_pictures import lanes_of
 from tflane_jax.tasks.marker_drive import DriveModel, DriveStep, MarkerDrive, as_trained, check_model, check_rate
 from tflane_jax.training.runtime import configure_jax
-from tflane_jax.world.cameras.ring import ARGOVERSE2_RING, NUSCENES_RING, CameraRigConfig, draw_rig
-from tflane_jax.world.cameras.sensor import render_cameras
-from tflane_jax.world.roads.markers import PlacementConfig
-from tflane_jax.world.simulate import WorldConfig, simulate
-
-_MOST_FRAMES = 7000  # an hour
-_RINGS = {"argoverse2": ARGOVERSE2_RING, "nuscenes": NUSCENES_RING}
 
 
 def run(options: argparse.Namespace) -> int:
@@ -85,15 +76,18 @@ def run(options: argparse.Namespace) -> int:
     detector = _detector(options, store)
     config = ReaderConfig(detector, range_, today=_day(options), max_age_days=_age(options))
     doubts = [*_without_lanes(store), *_doubtful_dates(store, _day(options), config.max_age_days)]
+    doubts += _without_images(drive, options.poses)
     steps = MarkerDrive(MarkerReader(store, as_trained(config, model)), model)
     faults: dict[str, str] = {}
     if model is not None:
         # A model that cannot read these images is refused before they are searched, which takes seconds each.
+        check_camera_names([camera.name for camera in drive.cameras], model.source)
         fitted_views(drive.views(drive.frames[0], faults), model.source)
     times = [frame.timestamp_ns for frame in drive.frames]
     _check_replaces(drive, options)
     check_rate(times, steps.interval if steps.remembers else None, steps.reader.config.residual_interval)
     make_folder(options.out)
+    _remove_pictures(options.out, {image for frame in drive.frames for image in frame.images.values()})
     frames: list[dict[str, Any]] = []
     head = {"store": str(options.store), "model": None if options.model is None else str(options.model)}
     head |= {"threshold": options.threshold}
@@ -107,7 +101,8 @@ def run(options: argparse.Namespace) -> int:
     boards = {f"boards {name}": outcomes[name] for name in get_args(Outcome)}
     guided = sum(bool(frame["guidance"]) for frame in frames)
     remembered = sum(frame["remembered"] for frame in frames)
-    rows = [{"frames": len(frames), "with lanes": guided, "from memory": remembered} | boards]
+    lanes = {"lanes dropped": sum(frame["lanes_dropped"] for frame in frames)}
+    rows = [{"frames": len(frames), "with lanes": guided, "from memory": remembered} | boards | lanes]
     print(format_table(rows, title=f"{options.poses}: markers of {options.store}"))
     print(f"\nwritten to {options.out}")
     for text in doubts:
@@ -152,7 +147,15 @@ def _follow(
                 threshold=options.threshold,
             )
             record = {"timestamp_ns": frame.timestamp_ns, "picture": picture}
+            record["lanes_dropped"] = _lanes_dropped(step, steps.most_lanes)
             frames.append(record | _record(step, views, names, options.threshold))
+
+
+def _lanes_dropped(step: DriveStep, most: int) -> int:
+    """Return how many lanes of a frame's boards are left out: beyond the capacity of a board, and of the prior."""
+    markers = step.reading.observed.markers
+    found = int((np.asarray(markers.lane_valid) & np.asarray(markers.valid)[:, None]).sum())
+    return step.reading.observed.lanes_dropped + max(found - most, 0)
 
 
 def _picture(number: int) -> str:
@@ -165,6 +168,22 @@ def _check_replaces(drive: Drive, options: argparse.Namespace) -> None:
     images = [image for frame in drive.frames for image in frame.images.values()]
     poses: Path = options.poses
     check_replaces(dict.fromkeys(written, poses), [poses, options.store, *images])
+
+
+def _remove_pictures(folder: Path, kept: Collection[Path]) -> None:
+    """Remove the pictures of an earlier drive that its frames.json names; those of two drives would mix."""
+    record = folder / "frames.json"
+    if not record.is_file():
+        return
+    try:
+        content = load_json(record)
+    except UserError:  # not of this command
+        return
+    frames, read = content.get("frames") if isinstance(content, dict) else None, {path.resolve() for path in kept}
+    for number, frame in enumerate(frames if isinstance(frames, list) else ()):
+        path = folder / _picture(number)
+        if isinstance(frame, dict) and frame.get("picture") == path.name and path.resolve() not in read:
+            path.unlink(missing_ok=True)
 
 
 def _model(folder: Path) -> DriveModel:
@@ -196,6 +215,15 @@ def _without_lanes(store: MarkerStore) -> list[str]:
         return []
     what = f"its {len(store.markers)} markers have no lanes" if store.markers else "it holds no marker"
     return [f"{store.source}: {what}, so that no frame gets a prior: is it the right store?"]
+
+
+def _without_images(drive: Drive, poses: Path) -> list[str]:
+    """Return a sentence for cameras that have no image in any frame; raise UserError if none has one."""
+    seen = {name for frame in drive.frames for name in frame.images}
+    if not seen:
+        raise UserError(f"{poses}: no frame names an image: nothing can be searched for markers")
+    blind = [camera.name for camera in drive.cameras if camera.name not in seen]
+    return [f"{poses}: no frame has an image of {', '.join(blind)}"] if blind else []
 
 
 def _doubtful_dates(store: MarkerStore, today: datetime.date, max_age_days: int | None) -> list[str]:
@@ -269,55 +297,3 @@ def _record(step: DriveStep, views: CameraViews, names: Sequence[str], threshold
             {"score": round(float(scores[q]), 4), "points": np.asarray(found.points[q]).round(3).tolist()} for q in best
         ]
     return record
-
-
-def render(options: argparse.Namespace) -> int:
-    """Write a drive of the built-in world: images, poses.json and store.json."""
-    if not 1 <= options.frames <= _MOST_FRAMES or not options.scale > 0.0:
-        raise UserError(f"--frames must be from 1 to {_MOST_FRAMES} and --scale positive")
-    surveyed = day_of(options.surveyed, "--surveyed")
-    if options.log < 0:
-        raise UserError(f"--log is the number of a scene, 0 or more, not {options.log}")
-    ring = _RINGS[options.ring]
-    if not 1 <= options.cameras <= len(ring):
-        raise UserError(f"--cameras is 1 to {len(ring)}, the cameras of --ring {options.ring}, not {options.cameras}")
-    boards = PlacementConfig(side="both", site="clear")
-    rig = CameraRigConfig(cameras=ring[: options.cameras], scale=options.scale, markers=True)
-    check_settings(rig, "--")
-    check_folder(options.out)
-    if options.out.is_dir() and any(options.out.iterdir()):
-        raise UserError(f"{options.out} is not empty: choose another folder (--out), images of two drives would mix")
-    # Two seconds of history come before the first frame.
-    world = WorldConfig(duration_s=1.6 + 0.5 * options.frames, keyframes=options.frames, markers=boards)
-    log = simulate(options.log, world)
-    store = store_of_log(log, radius=50.0, bike_lanes=True, surveyed=surveyed)
-    if not store.markers:
-        raise UserError(f"{log.name} has no junction, split or merge, and so no marker: take another --log")
-    with replacing(options.out) as folder:
-        _render(log, rig, store, folder)
-    print(
-        f"{options.frames} frames of {options.cameras} cameras written to {options.out}: images/, poses.json, "
-        "store.json"
-    )
-    return 0
-
-
-def _render(log: Log, rig: CameraRigConfig, store: MarkerStore, folder: Path) -> None:
-    """Write images, poses and store of a drive."""
-    cv2, images, frames = opencv(), folder / "images", []
-    sizes: dict[str, tuple[int, int]] = {}
-    images.mkdir(parents=True)
-    for number, moment in enumerate(progress_bar(log.keyframes, desc="render", unit="frame")):
-        views, files = render_cameras(log, number, rig), {}
-        for place, mount in enumerate(rig.cameras):
-            sizes[mount.name] = width, height = views.size[place].tolist()
-            files[mount.name] = images / f"{number:03d}-{mount.name}.png"
-            picture = np.asarray(views.image)[place, :height, :width, ::-1]
-            write_bytes(files[mount.name], cv2.imencode(".png", picture)[1].tobytes())
-        frames.append(DriveFrame(moment.timestamp_ns, moment.global_from_ego, files))
-    cameras = tuple(
-        DriveCamera(mount.name, camera.intrinsics, invert_pose(camera.camera_from_ego), size=sizes[mount.name])
-        for mount, camera in zip(rig.cameras, draw_rig(log.seed, rig), strict=True)
-    )
-    save_drive(Drive(cameras, tuple(frames)), folder / "poses.json", images)
-    save_store(store, folder / "store.json")

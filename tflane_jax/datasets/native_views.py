@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -16,6 +17,38 @@ from tflane_jax.scene import CameraViews
 from tflane_jax.world.cameras.ring import CameraRigConfig
 
 
+class CameraNamesWarning(UserWarning):
+    """The cameras of a drive have other names than those of a model."""
+
+
+def camera_names(source: Any) -> tuple[str, ...]:
+    """Return the cameras that a model reads which was trained on this source, in order; none for BEV evidence."""
+    if getattr(source, "image", None) is not None:
+        return source_of(source).cameras(source) or ()
+    rig = source.example.cameras
+    return () if rig is None else tuple(mount.name for mount in rig.cameras)
+
+
+def check_camera_names(names: Sequence[str], source: Any) -> None:
+    """Raise UserError for the cameras of a model in another order, which would be taken for each other.
+
+    Warns (`CameraNamesWarning`) of as many other names, whose order only the user knows.
+    """
+    wanted = camera_names(source)
+    if tuple(names) == wanted or len(names) != len(wanted):  # their number is checked with the images
+        return
+    if sorted(names) == sorted(wanted):
+        raise UserError(
+            f"the drive has the cameras {', '.join(names)}, the model reads them as {', '.join(wanted)}: give them in "
+            "this order"
+        )
+    warnings.warn(
+        f"the drive's cameras {', '.join(names)} are taken for the model's {', '.join(wanted)}, in this order",
+        CameraNamesWarning,
+        stacklevel=2,
+    )
+
+
 def fitted_views(views: CameraViews, source: Any) -> CameraViews:
     """Return the images scaled for a model that was trained on this source, smaller ones padded.
 
@@ -28,7 +61,7 @@ def fitted_views(views: CameraViews, source: Any) -> CameraViews:
     """
     image = getattr(source, "image", None)
     if image is not None:
-        _check_cameras(views, source_of(source).cameras(source) or ())
+        _check_cameras(views, camera_names(source))
         sizes = np.asarray(views.size).tolist()
         # Cameras without an image have their place in the array too, whose shape is the same in every frame.
         fits = [
@@ -52,12 +85,12 @@ def _check_cameras(views: CameraViews, names: Sequence[str]) -> None:
     if len(views.valid) != len(names):
         raise UserError(
             f"the model was trained with {len(names)} cameras ({', '.join(names)}), the drive has {len(views.valid)}: "
-            "give images of the same cameras, in this order"
+            "give images of the same cameras, in this order (tflane markers render: --ring and --cameras)"
         )
 
 
 def _of_rig(views: CameraViews, rig: CameraRigConfig) -> CameraViews:
-    _check_cameras(views, [mount.name for mount in rig.cameras])
+    _check_cameras(views, tuple(mount.name for mount in rig.cameras))
     fits: list[ImageFit | None] = []
     for number, mount in enumerate(rig.cameras):
         width, height = np.asarray(views.size)[number].tolist()

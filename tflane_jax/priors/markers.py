@@ -92,6 +92,8 @@ def marker_confidence(markers: MarkerObservations, config: MarkerPriorConfig) ->
 def select_marker_lanes(markers: MarkerObservations, config: MarkerPriorConfig) -> MarkerLanes:
     """Return the lanes of one frame's markers by descending confidence; padding may hold anything.
 
+    Where there are more than the prior takes, the nearest to the vehicle come first among those of equal confidence.
+
     Raises ValueError if the lanes have fewer points than the configuration.
     """
     xp = namespace(markers.lanes, markers.valid)
@@ -100,15 +102,18 @@ def select_marker_lanes(markers: MarkerObservations, config: MarkerPriorConfig) 
         raise ValueError(f"the markers' lanes have {points} points, the prior asks for {config.points}")
     valid = (markers.lane_valid & markers.valid[:, None]).reshape(-1)
     flat = markers.lanes[..., :2].reshape(count * lanes, points, 2)[:, stride(points, config.points)]
+    flat = xp.where(valid[:, None, None], flat, 0.0)
     same = np.repeat(np.eye(count, dtype=bool), lanes, 0).repeat(lanes, 1)
     edges = xp.broadcast_to(markers.successor[:, :, None, :], (count, lanes, count, lanes))
     edges = edges.reshape(count * lanes, count * lanes) & same & valid[:, None] & valid[None, :]
     trust = xp.where(valid, xp.repeat(marker_confidence(markers, config), lanes), 0.0)
-    # Stable: lanes of one marker keep their order; padding comes last.
-    order = xp.argsort(xp.where(valid, -trust, xp.inf), stable=True)[: config.lanes]
+    near = xp.square(flat).sum(-1).min(-1)
+    # Stable: lanes of one marker keep their order if all have a place; padding comes last.
+    near = xp.where(valid.sum() > config.lanes, near, 0.0)
+    order = xp.lexsort((near, xp.where(valid, -trust, xp.inf)))[: config.lanes]
     missing = config.lanes - len(order)
     return MarkerLanes(
-        points=xp.pad(xp.where(valid[:, None, None], flat, 0.0)[order], ((0, missing), (0, 0), (0, 0))),
+        points=xp.pad(flat[order], ((0, missing), (0, 0), (0, 0))),
         confidence=xp.pad(trust[order], (0, missing)),
         successor=xp.pad(edges[order][:, order], ((0, missing), (0, missing))),
         valid=xp.pad(valid[order], (0, missing)),

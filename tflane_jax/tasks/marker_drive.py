@@ -120,6 +120,11 @@ class MarkerDrive:
         """Whether earlier frames count, so that the rate of frames does; always without a model."""
         return self.model is None or self._model_remembers
 
+    @property
+    def most_lanes(self) -> int:
+        """How many lanes of a frame's markers the prior takes, those of the most trusted markers first."""
+        return self._prior.config.prior.lanes
+
     def restart(self, reader: MarkerReader) -> None:
         """Begin another drive, with its own store, without compiling the model again."""
         self.reader, self._last = reader, None
@@ -209,7 +214,8 @@ def check_rate(times_ns: Sequence[int], interval: float | None, residual_interva
 def check_model(task: Any) -> LaneGraphTask:
     """Return the task of a model for drives; raises UserError for one that predicts no lanes around the vehicle.
 
-    Warns (`MissingPriorWarning`) of a model with another prior than markers, which finds it empty in every frame.
+    Warns (`MissingPriorWarning`) of a model with another prior than markers, which finds it empty in every frame, and
+    of one that reads no markers.
     """
     if not isinstance(task, LaneGraphTask):
         raise UserError("the model reads single photos: give --model a run of a host with cameras")
@@ -217,6 +223,13 @@ def check_model(task: Any) -> LaneGraphTask:
     if absent := " and ".join(name for name, there in found.items() if there):
         warnings.warn(
             f"the model reads {absent}, and a drive has none: its lanes may be worse than in its evaluation",
+            MissingPriorWarning,
+            stacklevel=2,
+        )
+    if task.model.priors.markers is None:
+        warnings.warn(
+            "the model reads no markers: boards, memory and their lanes are shown, and its own lanes do not depend on "
+            "them",
             MissingPriorWarning,
             stacklevel=2,
         )

@@ -60,10 +60,10 @@ def check_origins(reference: str, seeds: Sequence[int]) -> None:
         try:
             _starting_checkpoint(folder)
         except UserError as error:
-            raise UserError(
-                f"training.init_from is {reference}: {error}; make that run first (tflane train, or tflane convert for "
-                "published weights), or name another"
-            ) from error
+            remedy = "make that run first (tflane train, or tflane convert for published weights), or name another"
+            if reference.lower() == "none":
+                remedy = "write None to start from no run"
+            raise UserError(f"training.init_from is {reference}: {error}; {remedy}") from error
 
 
 def origins(reference: str, seeds: Sequence[int], *, read: bool = False) -> list[dict[str, Any]]:

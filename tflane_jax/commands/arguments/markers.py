@@ -81,7 +81,7 @@ def _run(inner) -> None:
 
 def _render(inner) -> None:
     render = command(
-        inner, "render", "write a drive of the built-in world with its store", module="marker_run", function="render"
+        inner, "render", "write a drive of the built-in world with its store", module="marker_render", function="render"
     )
     render.add_argument("--log", metavar="SCENE", type=int, required=True, help="number of the scene")
     render.add_argument("--frames", type=int, default=8, help="frames, half a second apart (default 8)")

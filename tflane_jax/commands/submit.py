@@ -79,9 +79,8 @@ def run(options: argparse.Namespace) -> int:
         _tell_size(write_submission(options.out, found, author))
     elif isinstance(source, NuScenesConfig):
         if given := [name for name in _OF_SERVER if getattr(options, name)]:
-            raise UserError(
-                f"--{given[0].replace('_', '-')} is for OpenLane-V2's server: MapTR's file has no place for it"
-            )
+            option = f"--{given[0].replace('_', '-')}"
+            raise UserError(f"{option} is for OpenLane-V2's server: MapTR's file has no place for it, leave it out")
         if "lines" not in predicts:
             raise UserError("MapTR's file for nuScenes holds lines of a vector map, and this model predicts none")
         dataset = NuScenesDataset(source)
@@ -135,7 +134,9 @@ def _tell_size(path: Path) -> None:
         )
 
 
-def _record(dataset: OpenLaneV2Dataset, answer: Prediction, lanes: int | None, most: int | None) -> dict[str, Any]:
+def _record(
+    dataset: OpenLaneV2Dataset, answer: Prediction, most_lanes: int | None, most_elements: int | None
+) -> dict[str, Any]:
     """Return the best predictions of a frame; a model of both kinds of lanes submits its segments."""
     elements = answer.elements
     if elements is not None:
@@ -143,6 +144,9 @@ def _record(dataset: OpenLaneV2Dataset, answer: Prediction, lanes: int | None, m
         elements = elements.replace(box=boxes)  # pyright: ignore[reportAttributeAccessIssue]
     if answer.segments is not None:
         crossings = "sides" if answer.segments.areas is None else "ring"
-        return segment_record(best_segments(detections_of_segments(answer.segments, elements), lanes, most), crossings)
+        found = detections_of_segments(answer.segments, elements)
+        return segment_record(best_segments(found, most_lanes, most_elements), crossings)
     assert answer.centerlines is not None
-    return centerline_record(best_lanes(detections_of_centerlines(answer.centerlines, elements), lanes, most))
+    return centerline_record(
+        best_lanes(detections_of_centerlines(answer.centerlines, elements), most_lanes, most_elements)
+    )

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import pytest
 
 from tests.tiny_run import CONFIG, use_fakes
-from tflane_jax.cli import main
+from tflane_jax.cli import build_parser, main
 from tflane_jax.commands import submit
 from tflane_jax.commands.sources import chosen_source, data_name, model_title
 from tflane_jax.config import LogData, NuScenesData, RunConfig, WorldData, load_config
@@ -138,13 +138,13 @@ def test_pictures_of_a_run_in_a_store_name_its_model(folder, config, title, tmp_
     assert model_title(Run(folder, load_config(config), 3, ())) == title
 
 
-def test_what_only_one_server_takes_is_refused_elsewhere(monkeypatch, tmp_path):
+@pytest.mark.parametrize("option", ["--country", "--most-lanes"])
+def test_what_only_one_server_takes_is_refused_elsewhere(option, monkeypatch, tmp_path):
     config = RunConfig(data=NuScenesData(tmp_path / "nowhere"))
     monkeypatch.setattr(submit, "opened", lambda options: (SimpleNamespace(config=config), []))
-    given = {"data": None, "root": None, "split": None, "default_split": "test", "openlane": None, "data_dict": None}
-    told = {"method": "", "authors": [], "email": "", "institution": "", "country": "CH", "team": ""}
-    with pytest.raises(UserError, match="--country is for OpenLane-V2's server"):
-        submit.run(argparse.Namespace(out=tmp_path / "out.json", **given, **told))
+    options = build_parser().parse_args(["submit", "run", "--out", str(tmp_path / "out.json"), option, "7"])
+    with pytest.raises(UserError, match=f"{option} is for OpenLane-V2's server"):
+        submit.run(options)
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Numbers that pages quote from tables: those of docs/results and docs/carry_over, cell by cell.
+"""Numbers that pages quote from tables: those of docs/results, docs/controls and docs/carry_over, cell by cell.
 
 A quoting table stands below `<!-- results: NAME -->`, which names the recorded table. Its columns and rows have shorter
 names than there, which this file translates.
@@ -70,7 +70,11 @@ FINDING = re.compile(rf"({NUMBER}) points \((?:95 % ({NUMBER}) to ({NUMBER})[,)]
 
 def summaries():
     """Return the recorded tables by name."""
-    paths = [*(ROOT / "docs" / "results").glob("*.json"), ROOT / "docs" / "carry_over" / "carry_over.json"]
+    folders = ROOT / "docs" / "results", ROOT / "docs" / "controls"
+    paths = [
+        *(path for folder in folders for path in folder.glob("*.json")),
+        ROOT / "docs" / "carry_over" / "carry_over.json",
+    ]
     return {path.stem: {"findings": [], **json.loads(path.read_text(encoding="utf-8"))} for path in paths}
 
 

@@ -138,6 +138,16 @@ def test_pictures_of_a_run_in_a_store_name_its_model(folder, config, title, tmp_
     assert model_title(Run(folder, load_config(config), 3, ())) == title
 
 
+def test_a_submission_that_the_server_may_refuse_is_told(monkeypatch, tmp_path, capsys):
+    path = tmp_path / "submission.pkl"
+    path.write_bytes(b"0" * 3_000_000)
+    submit._tell_size(path)
+    assert capsys.readouterr().err == ""
+    monkeypatch.setattr(submit, "_LARGEST", 2e6)
+    submit._tell_size(path)
+    assert f"warning: {path} has 3 MB: OpenLane-V2's server was reported to refuse more" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("option", ["--country", "--most-lanes"])
 def test_what_only_one_server_takes_is_refused_elsewhere(option, monkeypatch, tmp_path):
     config = RunConfig(data=NuScenesData(tmp_path / "nowhere"))

@@ -6,11 +6,10 @@ The Python interface behind `tflane train`, `eval` and `predict`, also for noteb
 from __future__ import annotations
 
 import contextlib
-import functools
 import importlib.util
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -160,26 +159,6 @@ def build_data(source: Any) -> None:
     build = source_of(source).build
     if build is not None:
         build(source, True)
-
-
-def load_test_data(config: RunConfig) -> Any:
-    """Return the examples of a configuration's test split; the latest result is cached in memory."""
-    return _loaded(_TestData(config.data.source("test"), type(config.task), config.task.parts, config.task))
-
-
-@dataclass(frozen=True)
-class _TestData:
-    """Key of the cache: equal for all tasks of one class that read the same parts of an example."""
-
-    source: Any
-    kind: type
-    parts: tuple[str, ...]
-    task: Any = field(compare=False)
-
-
-@functools.lru_cache(maxsize=1)
-def _loaded(data: _TestData) -> Any:
-    return data.task.load(data.source)
 
 
 def resumable_config(folder: Path) -> RunConfig:

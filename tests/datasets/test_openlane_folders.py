@@ -7,6 +7,7 @@ import shutil
 import pytest
 
 from tests.datasets.openlane_scenes import FRAMES, DriveConfig, DriveDataset
+from tflane_jax.ablations.held_out import load_test_data
 from tflane_jax.cli import main
 from tflane_jax.config import OpenLaneV2Data, RunConfig, WorldData
 from tflane_jax.datasets.data_source import Choice
@@ -154,6 +155,7 @@ def test_nothing_is_trained_on_or_scored_by_the_official_test_split(folder):
     for why, run in (
         ("an evaluation", lambda: check_labelled(data.source("test"), "an evaluation")),
         ("validation", lambda: check_run(RunConfig(data=data))),
+        ("an evaluation", lambda: load_test_data(RunConfig(data=data))),
     ):
         with pytest.raises(UserError, match=rf"{why} needs truth: .*\.json has no annotation, as the official test"):
             run()

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from tflane_jax.ablations.facts import facts
+from tflane_jax.ablations.held_out import load_test_data
 from tflane_jax.ablations.jobs import Failure, Job
 from tflane_jax.ablations.results import Results
 from tflane_jax.ablations.scores import CHECKPOINTS, OWN_TEST, measure, with_test_set
@@ -17,7 +18,7 @@ from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import write_json
 from tflane_jax.own_modules import own_code
 from tflane_jax.progress import progress_bar
-from tflane_jax.runs import load_test_data, open_run
+from tflane_jax.runs import open_run
 from tflane_jax.tasks import Model
 from tflane_jax.training.provenance import read_provenance
 

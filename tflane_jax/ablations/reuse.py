@@ -2,9 +2,9 @@
 
 A recorded run replaces a training with the same configuration, seed and thread setting. If none has the thread setting
 of this process, one with another setting does, because a table is made from what was trained, wherever that was. A run
-that another table recorded is used only if this table has no record of it and this machine has not trained it. Before
-that, rows of a seed that start from one host are taken from the training of it that most of them have. Runs of a CPU
-and of an accelerator do not meet in a table, see `with_recorded`.
+that another table recorded is used only if this table has no record of it and this machine has not trained it. Where
+the rows of a seed start from one host, and that was trained more than once, runs from the training that most rows have
+come before all others. Runs of a CPU and of an accelerator do not meet in a table, see `with_recorded`.
 """
 
 from __future__ import annotations
@@ -133,10 +133,10 @@ def with_recorded(
 
 
 def _from_one_host(candidates: Mapping[str, Sequence[Sequence[Job]]]) -> dict[str, list[Job]]:
-    """Return the first candidate of each run, but of runs with one host those of the training of it that most have.
+    """Return the run that each row takes: one from the training of its host that most rows have, else the first.
 
-    Runs of one host name the same folder in `training.init_from`; what its trainings were, `Facts.origins` tells.
-    Where two trainings have as many runs, that of the first candidates counts.
+    Rows of one host and seed name the same folder in `training.init_from`; from which training of it a run started,
+    `Facts.origins` tells. Of two trainings that as many rows have, the one that is met first counts.
 
     Args:
         candidates: for each row and seed the runs that can be taken, best first, at least one.

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import tflane_jax
+from tflane_jax.ablations.held_out import load_test_data
 from tflane_jax.ablations.jobs import Job
 from tflane_jax.ablations.recorded import Measured, Which, evaluation_name
 from tflane_jax.config import RunConfig
@@ -28,7 +29,7 @@ from tflane_jax.errors import UserError
 from tflane_jax.evaluation.results import SceneRatio, SceneSamples
 from tflane_jax.files.atomic import write_json
 from tflane_jax.own_modules import own_content
-from tflane_jax.runs import load_test_data, open_run
+from tflane_jax.runs import open_run
 from tflane_jax.training.checkpoint import Checkpoints
 
 CHECKPOINTS: tuple[Which, ...] = ("last", "best")

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Literal
 
 from tflane_jax.ablations.comparison import compact
+from tflane_jax.ablations.held_out import load_test_data
 from tflane_jax.ablations.scores import with_settings
 from tflane_jax.config import RunConfig
 from tflane_jax.config_help import meaning
@@ -19,7 +20,7 @@ from tflane_jax.files.atomic import check_folder
 from tflane_jax.migrations import value_at
 from tflane_jax.plots.tables import counted, format_table, save_table
 from tflane_jax.progress import progress_bar
-from tflane_jax.runs import Run, load_test_data, open_run
+from tflane_jax.runs import Run, open_run
 
 
 def sweep(

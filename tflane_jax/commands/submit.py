@@ -128,7 +128,7 @@ def _map_frames(dataset: NuScenesDataset, answers: Iterator[tuple[int, Predictio
 def _tell_size(path: Path) -> None:
     if (size := path.stat().st_size) > _LARGEST:
         print(
-            f"{path} has {size / 1e6:.0f} MB: OpenLane-V2's server was reported to refuse more than "
+            f"tflane: warning: {path} has {size / 1e6:.0f} MB: OpenLane-V2's server was reported to refuse more than "
             f"{_LARGEST / 1e6:.0f}; --most-lanes and --most-elements keep the best of each frame",
             file=sys.stderr,
         )

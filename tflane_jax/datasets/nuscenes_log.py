@@ -240,8 +240,8 @@ def scene_tracks(
     tracks.yaw[f, k] = wrap_angle(yaw)
     tracks.occluded[f, k] = _unseen(tables, rows, where, least_visibility)
     tracks.valid[f, k] = True
-    place = tables.where("sample", frames.samples[0]["token"])
-    check_headings(tracks, frames.global_from_frame, frames.timestamps_ns, f"the scene from {place}")
+    place = f"{tables.folder / 'sample_annotation'}.json: boxes from sample {frames.samples[0]['token']} on"
+    check_headings(tracks, frames.global_from_frame, frames.timestamps_ns, place)
     return tracks
 
 

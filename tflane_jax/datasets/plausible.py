@@ -1,4 +1,4 @@
-"""Plausibility checks of a drive: jumps of the vehicle, a map of another place, boxes too far away or driving sideways.
+"""Plausibility checks of a drive: jumps, a map of another place, boxes too far away, vehicles that drive sideways.
 
 Such files would give examples without lanes or with senseless traffic, and no error. A line of a map with one
 coordinate of thousands of kilometres would fill the memory with its points.
@@ -32,9 +32,9 @@ LARGEST_DISTORTION = 100.0
 # Metres from the vehicle to a box; the annotators of nuScenes saw some 150 m far.
 _UNSEEN = 500.0
 
-# In nine recorded drives the median of a moving vehicle's angles is 15 degrees at most.
+# Metres per second; radians between heading and motion, whose median is 15 degrees at most for each moving vehicle of
+# nine recorded drives; how many vehicles must move, each in as many intervals.
 _MOVING, _SIDEWAYS, _FEWEST = 3.0, np.radians(45.0), 3
-"""Metres per second, radians, and vehicles (or intervals of one)."""
 
 SHORTEST, LONGEST = 0.002, 60.0
 """Seconds between the frames of a drive: less or more means that its times are in another unit."""
@@ -122,8 +122,8 @@ def check_headings(
 ) -> None:
     """Raise UserError, which names the place, where most moving vehicles do not head in the direction of their motion.
 
-    Rotations in another order or unit, or axes that are swapped, would turn the lanes that traffic flow tells of. Some
-    vehicles reverse; with fewer than three that move, nothing is said.
+    Rotations in another order, direction or unit, or axes that are swapped, would turn the lanes that traffic flow
+    tells of. Some vehicles reverse; with fewer than three that move, nothing is said.
     """
     centre = transform_points(global_from_frame, tracks.position)[..., :2]
     heading = tracks.yaw + pose_yaw(global_from_frame)[:, None]
@@ -136,5 +136,5 @@ def check_headings(
     if len(of_each) >= _FEWEST and sideways > len(of_each) / 2:
         raise UserError(
             f"{where}: {sideways} of {len(of_each)} moving vehicles do not head where they move (the median of all is "
-            f"{np.degrees(np.median(of_each)):.0f} degrees off): are the rotations in another order or unit?"
+            f"{np.degrees(np.median(of_each)):.0f} degrees off): are the rotations in another order, direction or unit?"
         )

@@ -72,3 +72,38 @@ def test_a_seed_does_not_decide_for_another(table, trained):
 def test_rows_that_were_trained_nowhere_else_stay(table, trained, tmp_path):
     archive = recorded(trained, {"base": OTHER, "tfm": ()})
     assert taken(table, tmp_path, archive) == {"base": [True] * 2, "tfm": [True] * 2}
+
+
+@pytest.fixture(scope="module")
+def with_host(table, cheap, tmp_path_factory):
+    """Return the table with its host as a row, and its runs."""
+    table = replace(table, rows=(*table.rows, *table.hosts))
+    out = tmp_path_factory.mktemp("with host")
+    run_table(table, range(2), out)
+    return table, out
+
+
+def test_a_row_that_is_the_host_takes_the_training_that_the_others_started_from(with_host, capsys):
+    table, out = with_host
+    archive = recorded(out, {"host": None})
+    assert all(run.facts.gives for run in archive.runs.values())
+    other = {key: replace(run, facts=replace(run.facts, gives=OTHER)) for key, run in archive.runs.items()}
+    assert taken(table, out, archive) == {"base": [False] * 2, "tfm": [False] * 2, "host": [True] * 2}
+    assert taken(table, out, replace(archive, runs=other))["host"] == [False] * 2
+
+
+def test_a_row_that_is_another_training_of_the_host_is_told(with_host, tmp_path):
+    table, out = with_host
+    archive = recorded(out, {"base": None, "tfm": None, "host": None})
+    other = {
+        key: replace(run, facts=replace(run.facts, gives=OTHER)) if (run.row, run.seed) == ("host", 1) else run
+        for key, run in archive.runs.items()
+    }
+    for place, runs in (("same", archive.runs), ("other", other)):
+        run_table(table, range(2), tmp_path / place, archive=replace(archive, runs=runs), finished=True)
+    told = {
+        place: json.loads((tmp_path / place / "paper.9" / "summary.json").read_text())["mixed hosts"]
+        for place in ("same", "other")
+    }
+    mixed = "Rows of seed 1 do not all start from one known training of host: they may differ by their hosts."
+    assert told == {"same": [], "other": [mixed]}

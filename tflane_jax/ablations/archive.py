@@ -39,6 +39,8 @@ _LARGEST_NUMBER = 2**53
 _LONGEST_TEXT, _LONGEST_SETTING = 300, 10_000
 _STEPS = 10**DIGITS
 """Files hold scores of samples as integers: the score times this."""
+_HASHES = "origins", "gives"
+"""Attributes of `Facts` that are left out where they are empty, as in earlier records."""
 
 T = TypeVar("T")
 
@@ -142,7 +144,7 @@ def write_archive(path: Path, archive: Archive) -> Path:
             "devices": list(run.facts.devices),
             "seconds": run.facts.seconds,
             "validation": list(run.facts.validation),
-            **({"origins": list(run.facts.origins)} if run.facts.origins else {}),
+            **{name: list(hashes) for name in _HASHES if (hashes := getattr(run.facts, name))},
             "measured": {name: entry(measured) for name, measured in run.measured.items()},
         }
         for key, run in sorted(archive.runs.items(), key=lambda item: (item[1].row, item[1].seed, item[0]))
@@ -284,7 +286,7 @@ def _run(key: str, run: Any, configs: Sequence[Any], entries: Sequence[Measured]
             devices=texts("devices"),
             seconds=None if seconds is None else float(_number(seconds, f"{where}: seconds")),
             validation=tuple(_validation(record, f"{where}: validation {i}") for i, record in records),
-            origins=texts("origins") if "origins" in run else (),
+            **{name: texts(name) for name in _HASHES if name in run},
         ),
         measured={
             _text(name, where): None if place is None else _chosen(entries, place, f"{where}: {name[:_LONGEST_TEXT]}")

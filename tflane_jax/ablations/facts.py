@@ -8,6 +8,8 @@ from typing import Any
 from tflane_jax.ablations.jobs import Job
 from tflane_jax.ablations.paper.table import TableRow
 from tflane_jax.ablations.recorded import Facts
+from tflane_jax.errors import UserError
+from tflane_jax.training.fine_tuning import origins
 from tflane_jax.training.provenance import commit_of, read_provenance
 from tflane_jax.training.records import read_records
 
@@ -27,6 +29,17 @@ def facts(job: Job) -> Facts:
     )
 
 
+def given_hashes(job: Job) -> tuple[str, ...]:
+    """Return the hashes by which runs that start from a finished run name it; () where a record lacks them."""
+    if job.recorded is not None:
+        return job.recorded.facts.gives
+    try:
+        (own,) = origins(str(job.folder), job.config.training.seeds, read=True)
+    except UserError:  # without checkpoints any more, it can still be measured from its kept scores
+        return ()
+    return own["parameters"], own["content"]
+
+
 def _hash(origin: Mapping[str, Any]) -> str:
     """Return the hash of what a run started from: of the parameters, or of the files in earlier runs."""
     return origin.get("parameters", origin["content"])
@@ -36,13 +49,20 @@ def mixed_hosts(rows: Sequence[TableRow], trained: Mapping[str, Sequence[Job]]) 
     """Return a sentence for each host of which the rows of a seed do not all start from one training.
 
     A host that is trained on two kinds of processors differs in the last bits first, and then in its scores, so that
-    such rows differ in more than what the table compares. Rows whose start is not recorded count as others.
+    such rows differ in more than what the table compares. Rows whose start is not recorded count as others; a row that
+    is the host itself counts as another if it is known to be one.
     """
     found: dict[str, dict[int, set[tuple[str, ...]]]] = {}
     for row in rows:
         for job in trained.get(row.name, ()) if row.start else ():
             (seed,) = job.config.training.seeds
             found.setdefault(row.start, {}).setdefault(seed, set()).add(facts(job).origins)
+    for row in rows:
+        for job in trained.get(row.name, ()) if row.name in found else ():
+            (seed,) = job.config.training.seeds
+            started, gives = found[row.name].get(seed, set()), given_hashes(job)
+            if gives and not any(set(gives) & set(of_row) for of_row in started):
+                started.add(gives)
     sentences = []
     for host, by_seed in found.items():
         if mixed := sorted(seed for seed, origins in by_seed.items() if len(origins) > 1):

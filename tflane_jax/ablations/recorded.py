@@ -45,6 +45,7 @@ class Facts:
         seconds: of all updates, without evaluation and compiling; None if the run has no record of it.
         validation: records of the validation split, see `training.records`.
         origins: hashes of the checkpoints that it started from; () for random parameters, and in earlier records.
+        gives: hashes that stand in `origins` of runs that start from this one; () where that is not known.
     """
 
     commits: tuple[str, ...]
@@ -52,6 +53,7 @@ class Facts:
     seconds: float | None
     validation: tuple[Record, ...]
     origins: tuple[str, ...] = ()
+    gives: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

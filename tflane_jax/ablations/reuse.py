@@ -19,7 +19,7 @@ from typing import Any
 
 from tflane_jax.ablations.archive import Archive, merged, read_archive, write_archive
 from tflane_jax.ablations.declaration import Claim, Declaration, model_of_row
-from tflane_jax.ablations.facts import facts
+from tflane_jax.ablations.facts import facts, given_hashes
 from tflane_jax.ablations.jobs import Job
 from tflane_jax.ablations.recorded import Measured, RecordedRun, evaluation_name
 from tflane_jax.ablations.scores import evaluations, is_measured, measure
@@ -136,7 +136,8 @@ def _from_one_host(candidates: Mapping[str, Sequence[Sequence[Job]]]) -> dict[st
     """Return the run that each row takes: one from the training of its host that most rows have, else the first.
 
     Rows of one host and seed name the same folder in `training.init_from`; from which training of it a run started,
-    `Facts.origins` tells. Of two trainings that as many rows have, the one that is met first counts.
+    `Facts.origins` tells. Of two trainings that as many rows have, the one that is met first counts. A row that is the
+    host itself takes that training too, where it is known.
 
     Args:
         candidates: for each row and seed the runs that can be taken, best first, at least one.
@@ -153,8 +154,11 @@ def _from_one_host(candidates: Mapping[str, Sequence[Sequence[Job]]]) -> dict[st
     most = {host: count.most_common(1)[0][0] for host, count in counts.items() if count}
 
     def best(each: Sequence[Job]) -> Job:
-        wanted = most.get(_host(each))
-        return next((job for job in each if wanted and origins(job) == wanted), each[0])
+        if wanted := most.get(_host(each)):
+            return next((job for job in each if origins(job) == wanted), each[0])
+        if given := most.get(str(each[-1].folder)):
+            return next((job for job in each if job.is_complete() and set(given) & set(given_hashes(job))), each[0])
+        return each[0]
 
     return {name: [best(each) for each in of_row] for name, of_row in candidates.items()}
 
@@ -318,7 +322,7 @@ def _recorded(key: str, row: str, job: Job, scores: Collection[str], curves: Col
         seed=job.config.training.seeds[0],
         config=portable(job),
         threads=dict(job.threads),
-        facts=replace(own, validation=validation),
+        facts=replace(own, validation=validation, gives=given_hashes(job)),
         measured=found,
         time=now,
     )

@@ -164,10 +164,23 @@ def test_operations_of_a_scan_are_those_of_all_frames():
     assert scan == pytest.approx(unrolled, rel=1e-6)
 
 
-def test_only_a_host_with_bev_memory_loops_over_time():
+def test_single_frames_do_not_loop_over_time():
     assert replace(CAMERA_CLIPS, time="scan").loops
-    for task in (CAMERA_CLIPS, replace(CLIPS, time="scan"), replace(CAMERA_CLIPS, clip=1, time="scan")):
-        assert not task.loops
+    assert not CAMERA_CLIPS.loops
+    assert not replace(CAMERA_CLIPS, clip=1, time="scan").loops
+
+
+def test_a_scan_without_bev_memory_gives_the_losses_of_all_frames_at_once(params):
+    batch = as_clips(scenes(), 3)
+    results = [
+        jax.jit(jax.value_and_grad(task.loss, has_aux=True))(params, batch, jax.random.key(0))
+        for task in (CLIPS, replace(CLIPS, time="scan"))
+    ]
+    ((loss, terms), gradient), ((scanned, same), again) = results
+    np.testing.assert_allclose(scanned, loss, rtol=1e-6)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(b, a, rtol=1e-5, atol=1e-6), terms, same)
+    size = np.sqrt(sum(np.square(leaf).sum() for leaf in jax.tree.leaves(gradient)))
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(b, a, rtol=1e-3, atol=1e-5 * size), gradient, again)
 
 
 @pytest.mark.slow

@@ -56,9 +56,10 @@ class LaneGraphTask(Task[Example, Example | Streamed, LaneGraphSource, HostMemor
         losses: weights of the host's matching costs and losses.
         clip: number of successive frames that training processes with memory. A training example is then a clip, with a
             leading axis on every leaf, and evaluation streams through the scenes. 1: single frames.
-        time: how training passes through the frames of a clip, if the host carries BEV features from frame to frame.
-            "unrolled": the program holds every frame, and compiling takes as much longer; "scan": it holds one.
-            Losses are equal up to rounding.
+        time: how training passes through the frames of a clip. "unrolled": the program holds every frame, and
+            compiling takes as much longer; "scan": it holds one. Losses are equal up to rounding. A host that carries
+            no BEV features from frame to frame takes all frames at once, or with "scan" one after the other, which
+            needs less memory; dropout and the batch statistics of norms differ between the two.
         empty_frames: "skip" trains without frames that have none of the lanes or crossings of the host's ground truth
             (`HostConfig.wanted_truth`), as TopoNet and LaneSegNet do.
     """
@@ -87,7 +88,7 @@ class LaneGraphTask(Task[Example, Example | Streamed, LaneGraphSource, HostMemor
     @property
     def loops(self) -> bool:
         """Whether the frames of a clip pass through the model in a loop."""
-        return self.clip > 1 and self.time == "scan" and self.start().bev is not None
+        return self.clip > 1 and self.time == "scan"
 
     @property
     def unrolled(self) -> LaneGraphTask:
@@ -141,10 +142,10 @@ class LaneGraphTask(Task[Example, Example | Streamed, LaneGraphSource, HostMemor
             (_, updated), found = lax.scan(body, (start.bev, statistics), frames, unroll=unroll)
             return found, updated
 
-        if self.clip > 1 and start.bev is None:
+        through_clips = self.loops or (self.clip > 1 and start.bev is not None)
+        if self.clip > 1 and not through_clips:
             # Without BEV memory, only the priors connect frames, and they have been observed already.
             batch, observations = _frames((batch, observations))
-        through_clips = self.clip > 1 and start.bev is not None
         keys = jax.random.split(key, len(jax.tree.leaves(batch)[0]))
         train: Any = jax.vmap(clip if through_clips else alone, axis_name=BATCH_AXIS, out_axes=(0, None))
         (outputs, auxiliary, lost), updated = train(batch, observations, keys)
@@ -225,8 +226,7 @@ class LaneGraphTask(Task[Example, Example | Streamed, LaneGraphSource, HostMemor
         images = source.example.cameras or getattr(source, "image", None)
         check_settings_fit(self.model, source.example, image_scale=None if images is None else images.scale)
         if self.time == "scan" and not self.loops:
-            clips = "'unrolled', without clips (task.clip above 1) of a host that carries BEV features between frames"
-            raise SettingError("task.time", self.time, clips)
+            raise SettingError("task.time", self.time, "'unrolled', without clips (task.clip above 1)")
         if world is not None and world.keyframes % self.clip:
             raise SettingError("data.world.keyframes", world.keyframes, f"a multiple of task.clip ({self.clip})")
 

@@ -1,6 +1,7 @@
 """`tflane train --config FILE --help`: every setting with its value and its meaning."""
 
 import dataclasses
+from typing import Literal, get_args, get_origin, get_type_hints
 
 from tests.test_config import configurations
 from tflane_jax.cli import main
@@ -18,6 +19,19 @@ def test_every_setting_of_the_shipped_configurations_is_explained():
             part, _, last = name.rpartition(".")
             if not meanings(type(parts[part])).get(last):
                 lacking.add(f"{type(parts[part]).__name__}.{last}")
+    assert lacking == set()
+
+
+def test_every_word_that_a_setting_allows_is_named():
+    lacking = set()
+    for config in configurations().values():
+        for part in (config, *(value for _, value in settings(config) if dataclasses.is_dataclass(value))):
+            told, hints = meanings(type(part)), get_type_hints(type(part))
+            for name in (field.name for field in dataclasses.fields(part)):
+                hint = hints[name]
+                literals = [kind for kind in (hint, *get_args(hint)) if get_origin(kind) is Literal]
+                words = [word for kind in literals for word in get_args(kind)]
+                lacking |= {(type(part).__name__, name, word) for word in words if f'"{word}"' not in told[name]}
     assert lacking == set()
 
 
@@ -42,13 +56,15 @@ class Part(Base):
     Attributes:
         size, low: see `Base`.
         way: "one", as in Fig. 4 (Li et al. 2020), which is a long text of more than a hundred and sixty characters so
-            that of its two sentences only the first one is shown; "other" is not seen. Nor this.
+            that of its two sentences only the first one is shown; this, too. "other" is not seen.
+        named: "near" is a word, "far" is another one.
 
     Raises:
         ValueError: never.
     """
 
-    way: str = "one"
+    way: Literal["one", "other"] | None = "one"
+    named: Literal["near", "far"] = "near"
 
 
 def test_meanings_are_those_of_docstrings_and_of_their_bases():
@@ -56,8 +72,9 @@ def test_meanings_are_those_of_docstrings_and_of_their_bases():
     assert found["size"] == "of the base, metres"
     assert found["low"] == found["high"] == "ends"
     assert found["way"].startswith('"one", as in Fig. 4 (Li et al. 2020), which is')
-    assert found["way"].endswith("only the first one is shown")
-    assert set(found) == {"size", "low", "high", "way"}
+    assert found["way"].endswith('only the first one is shown; this, too (allowed: "one", "other")')
+    assert found["named"] == '"near" is a word, "far" is another one'
+    assert set(found) == {"size", "low", "high", "way", "named"}
 
 
 def test_settings_stand_beside_their_meanings():

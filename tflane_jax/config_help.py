@@ -5,13 +5,15 @@ from __future__ import annotations
 import inspect
 import re
 import textwrap
+from collections.abc import Sequence
 from functools import cache
-from typing import Any
+from types import UnionType
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from tflane_jax.config_io import settings, value_text
 
 _ENTRY = re.compile(r" {4}(\w+(?:, \w+)*): (.*)")
-_SENTENCE = re.compile(r"(?<!Fig)(?<!Eq)(?<!Eqs)(?<! al)(?<=[\w)`\"'])[.;](?= |$)")
+_SENTENCE = re.compile(r"(?<!Fig)(?<!Eq)(?<!Eqs)(?<! al)(?<=[\w)`\"'])\.(?= |$)")
 _WHOLE = 160
 """A text of so many characters stands whole, of a longer one its first sentence."""
 _WIDTH, _COLUMN = 120, 62
@@ -33,7 +35,10 @@ def meaning(config: Any, name: str) -> str:
 
 @cache
 def meanings(kind: type) -> dict[str, str]:
-    """Return what the docstring of a class, or of its bases, says of each attribute; of long texts a sentence."""
+    """Return what the docstring of a class, or of its bases, says of each attribute; of long texts a sentence.
+
+    Behind it stand the words that are allowed, where it does not name them all.
+    """
     found: dict[str, str] = {}
     for base in reversed(kind.__mro__):
         _, _, section = inspect.cleandoc(base.__dict__.get("__doc__") or "").partition("\nAttributes:\n")
@@ -47,9 +52,21 @@ def meanings(kind: type) -> dict[str, str]:
                 found |= {name: f"{found[name]} {line.strip()}" for name in names}
             elif line:
                 break
-    return {
-        name: (text if len(text) <= _WHOLE else _SENTENCE.split(text)[0]).rstrip(".") for name, text in found.items()
-    }
+    hints = get_type_hints(kind)
+    short = {name: text if len(text) <= _WHOLE else _SENTENCE.split(text)[0] for name, text in found.items()}
+    return {name: _with_words(text.rstrip("."), _words(hints.get(name))) for name, text in short.items()}
+
+
+def _words(hint: Any) -> list[str]:
+    """Return the words that a type allows, alone or in a tuple, as the help writes them; [] for any other type."""
+    if get_origin(hint) in (Union, UnionType, tuple):
+        return [word for part in get_args(hint) for word in _words(part)]
+    return [f'"{word}"' for word in get_args(hint)] if get_origin(hint) is Literal else []
+
+
+def _with_words(text: str, words: Sequence[str]) -> str:
+    """Return a text, with the words behind it if it lacks one."""
+    return text if all(word in text for word in words) else f"{text} (allowed: {', '.join(words)})"
 
 
 def _row(setting: str, meaning: str) -> list[str]:

@@ -74,7 +74,8 @@ class OptimConfig:
             `encoder/images/backbone`, learn at `factor` times the rate, their weight decay included; `*` stands for any
             text, the first pattern that matches decides, and 0 keeps parameters as they are. Every pattern must match.
         warmup_steps: steps of linear rise from `warmup_ratio * lr` to `lr`.
-        warmup_ratio, final_ratio: first and last learning rate relative to `lr` (with restarts the last one is theirs).
+        warmup_ratio: first learning rate relative to `lr`.
+        final_ratio: last learning rate relative to `lr`; `restarts` have their own.
         weight_decay: on the parameters that `decayed` names.
         decayed: "kernels" and embeddings, or "all", biases and norms too, as the published camera hosts train.
         decay: "decoupled" from the gradient (AdamW), or "coupled": added to it, after clipping (PyTorch's Adam).

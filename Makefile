@@ -13,6 +13,7 @@ help:
 	@echo "make lint         ruff (rules and format) and pyright"
 	@echo "make same-losses  train every configuration in this checkout and in BEFORE=../before, compare bit by bit"
 	@echo "make bench        the benchmarks, as JSON under runs/bench"
+	@echo "make clean        delete the environment and the caches of these tools; trained runs stay"
 
 # Constraints pin every version; the index is whatever pip is configured with. Two processes install half of the pinned
 # packages each, which takes two thirds of the time of one; the last command adds what they could not install.
@@ -60,4 +61,4 @@ bench: $(STAMP)
 	$(BIN)/tflane bench --out runs/bench
 
 clean:
-	rm -rf $(VENV) runs .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) .pytest_cache .ruff_cache .hypothesis

@@ -2,6 +2,7 @@
 
 import contextlib
 import errno
+import importlib.metadata
 import multiprocessing
 import os
 import re
@@ -15,6 +16,7 @@ import jax
 import numpy as np
 import pytest
 
+from tflane_jax import errors
 from tflane_jax.child_processes import spared_interrupts
 from tflane_jax.cli import OneLineWarnings, main
 from tflane_jax.commands.train import score_table
@@ -180,6 +182,15 @@ def test_a_package_that_is_missing_is_named_with_its_remedy(tmp_path, monkeypatc
     )
     assert "Traceback" not in said
     assert not (tmp_path / "run").exists()
+
+
+def test_without_a_checkout_the_packages_of_an_extra_are_named(tmp_path, monkeypatch):
+    monkeypatch.setattr(errors, "_CHECKOUT", tmp_path / "pyproject.toml")
+    needed = ["Jax<1", 'pyarrow>=17; extra == "data"', "shapely>=2; extra == 'data'", 'matplotlib; extra == "plot"']
+    monkeypatch.setattr(importlib.metadata, "requires", lambda name: needed)
+    assert errors.install("data") == "run `pip install 'pyarrow>=17' 'shapely>=2'`"
+    monkeypatch.undo()
+    assert "pip install -e '.[data]'" in errors.install("data")
 
 
 def test_a_package_of_ones_own_that_is_missing_keeps_its_traceback():

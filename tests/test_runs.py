@@ -48,6 +48,18 @@ def test_a_start_from_another_model_is_told_before_data_are_read(config, tmp_pat
     assert not (tmp_path / "run").exists()
 
 
+def test_a_run_that_is_overwritten_is_none_to_start_from(config, tmp_path):
+    """Regression: it was deleted first, and no checkpoint was left if the training ended before its own first one."""
+    folder, link = tmp_path / "run_0", tmp_path / "link_0"
+    save_weights(config, {"scale": jnp.ones(3)}, folder)
+    link.symlink_to(folder)
+    for origin in (folder, link, tmp_path / "run_{seed}"):
+        tuned = replace(config, training=replace(config.training, init_from=str(origin)))
+        with pytest.raises(UserError, match=r"init_from is .*run_0, which --overwrite deletes: choose another --out"):
+            train_run(tuned, folder, start="overwrite", progress=False)
+    assert (folder / "checkpoints" / "step_00000000").is_dir()
+
+
 def aged(content):
     """Return a configuration (JSON) as an older version wrote it: another name, and without a newer setting."""
     old = renamed_back(content, {"OptimConfig": {"optimizer": "matrices"}})

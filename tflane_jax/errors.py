@@ -1,7 +1,13 @@
 """The errors that the command line shows to its user."""
 
+import importlib.metadata
+import re
+from pathlib import Path
+
 # Modules that only extras of this package install, and the extra of each.
 _EXTRAS = {"cv2": "images", "grain": "images", "matplotlib": "plot", "pyarrow": "data", "shapely": "data"}
+_CHECKOUT = Path(__file__).parents[1] / "pyproject.toml"
+_REQUIRED = re.compile(r"""([^;]+); *extra *== *["'](\w+)["'] *""")  # in the metadata of an installed package
 
 
 class LeftOutWarning(UserWarning):
@@ -21,8 +27,15 @@ def missing_extra(what: str, extra: str) -> UserError:
 
 
 def install(extra: str) -> str:
-    """Return how to install an extra of this package."""
-    return f"run `pip install -e '.[{extra}]'` in the checkout of tflane_jax"
+    """Return how to install an extra of this package: in its checkout, or without one by the names of the packages."""
+    if _CHECKOUT.is_file():
+        return f"run `pip install -e '.[{extra}]'` in the checkout of tflane_jax"
+    try:
+        required = [_REQUIRED.fullmatch(text) for text in importlib.metadata.requires("tflane_jax") or ()]
+    except importlib.metadata.PackageNotFoundError:  # a copy of the folder alone
+        return f"install what tflane_jax needs for [{extra}]"
+    packages = " ".join(f"'{found[1].strip()}'" for found in required if found is not None and found[2] == extra)
+    return f"run `pip install {packages}`"
 
 
 def not_installed(error: ModuleNotFoundError) -> UserError | None:

@@ -33,7 +33,7 @@ from tflane_jax.processes import agreed, from_first, is_first
 from tflane_jax.run_checks import agree_on_settings, check_model, check_origin_model, check_rate_factors, check_run
 from tflane_jax.startup import showing, stage
 from tflane_jax.training.checkpoint import Checkpoints, Which
-from tflane_jax.training.fine_tuning import check_origins
+from tflane_jax.training.fine_tuning import check_origins, origin_folders
 from tflane_jax.training.loop import Draw, TrainingResult, train
 from tflane_jax.training.manifest import Manifest
 from tflane_jax.training.provenance import add_provenance
@@ -97,7 +97,7 @@ def train_run(
     if start == "resume":
         from_first(lambda: check_unchanged(folder, to_json(config), current_form))
     else:
-        from_first(lambda: check_origin(config))
+        from_first(lambda: check_origin(config, replaced=folder if start == "overwrite" else None))
         from_first(lambda: check_origin_model(config))
     with showing(progress and is_first()):
         return _train(config, folder, start=start, progress=progress, drawn=drawn)
@@ -140,10 +140,16 @@ def _train(config: RunConfig, folder: Path, *, start: Start, progress: bool, dra
     )
 
 
-def check_origin(config: RunConfig) -> None:
-    """Raise UserError if the run to start from is missing, or frozen modules would start from no weights."""
-    if config.training.init_from is not None:
-        check_origins(config.training.init_from, config.training.seeds)
+def check_origin(config: RunConfig, *, replaced: Path | None = None) -> None:
+    """Raise UserError if the run to start from is missing, or frozen modules would start from no weights.
+
+    `replaced` is a run that is going to be deleted: none may start from it.
+    """
+    if (origin := config.training.init_from) is not None:
+        check_origins(origin, config.training.seeds)
+        folders = [] if replaced is None else origin_folders(origin, config.training.seeds)
+        if replaced is not None and replaced.resolve() in [folder.resolve() for folder in folders]:
+            raise UserError(f"training.init_from is {replaced}, which --overwrite deletes: choose another --out")
     if config.task.frozen and config.training.init_from is None:
         raise UserError(
             f"{', '.join(config.task.frozen)} would stay random: this configuration freezes them "

@@ -11,7 +11,8 @@ has the same backbone.
 
 An ablation NAME has one cosine over the run; `NAME_restarts` has the paper's Eq. (2) instead: three cycles, each twice
 as long as the one before, where none is extended; an extension of the first leaves room for two. The adaptive rule
-extends or restarts them by the validation loss. Nothing else differs between them.
+extends or restarts them by the validation loss. The cosine ends at a thousandth of its peak, a cycle at zero; nothing
+else differs between them.
 """
 
 import dataclasses

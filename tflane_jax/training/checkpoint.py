@@ -143,7 +143,10 @@ class Checkpoints:
                 f"{run} is no run folder: it has no config.json, and {self.folder} holds no checkpoint{hint}"
             )
         if not steps:
-            raise UserError(f"{self.folder} holds no checkpoint: the run ended before its first one was written")
+            raise UserError(
+                f"{self.folder} holds no checkpoint: the run ended before its first one was written; go on with it "
+                f"(tflane train --resume --out {self.folder.parent}) or delete it"
+            )
         step = steps[-1] if which == "last" else self.best_step() if which == "best" else which
         if step is None:
             wanted = f"the score {self._best_metric} (training.best_metric)" if self._best_metric else "a score"

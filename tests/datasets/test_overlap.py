@@ -154,6 +154,13 @@ def test_a_folder_without_drives_is_named(tmp_path, capsys):
     assert str(tmp_path) in capsys.readouterr().err
 
 
+def test_a_folder_of_neither_dataset_is_told_so(tmp_path):
+    with pytest.raises(UserError, match=r"holds no Argoverse 2 log: .*; nor a frame of OpenLane-V2: no <segment>/info"):
+        read_drives(tmp_path)
+    with pytest.raises(UserError, match=r"^there is no \S+: name a folder"):
+        read_drives(tmp_path / "none")
+
+
 def test_real_logs():
     logs = shared_root() / "data" / "argoverse2" / "sensor" / "val"
     if not logs.is_dir():

@@ -61,7 +61,12 @@ def read_drives(root: Path) -> list[DrivenPath]:
             where = numbers(member(pose, "translation", f"{file}: pose"), (3,), f"{file}: pose.translation")
             drives.setdefault(file.parent.parent, []).append(where[:2])
         return [DrivenPath(folder.name, "", np.stack(where)) for folder, where in drives.items()]
-    return [_log_drive(folder) for folder in find_logs(root)]
+    try:
+        logs = find_logs(root)
+    except UserError as error:
+        also = "; nor a frame of OpenLane-V2: no <segment>/info/<timestamp>.json" if root.is_dir() else ""
+        raise UserError(f"{error}{also}") from None
+    return [_log_drive(folder) for folder in logs]
 
 
 def _log_drive(folder: Path) -> DrivenPath:

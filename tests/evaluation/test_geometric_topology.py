@@ -8,9 +8,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.special import expit, logit
 
-from tflane_jax.evaluation.geometric_topology import SCALE, geometric_edges, with_geometric_topology
+from tflane_jax.evaluation.centerlines import detections_of_centerlines
+from tflane_jax.evaluation.geometric_topology import SCALE, edge_confidences, geometric_edges
+from tflane_jax.metrics import CenterlineMetrics
+from tflane_jax.metrics.frames import LaneTruth
 from tflane_jax.metrics.matching import vertex_average_precision
-from tflane_jax.scene import CenterlinePrediction, Prediction
+from tflane_jax.scene import CenterlinePrediction
 
 
 def lanes(*ends):
@@ -41,24 +44,16 @@ def test_translation_and_order_do_not_matter(shift, order):
     np.testing.assert_array_equal(geometric_edges(CHAIN[order]), geometric_edges(CHAIN)[np.ix_(order, order)])
 
 
-def confidences(lines, learned):
-    """Return the confidences of edges with geometry, and the plain sums that TopoLogic evaluates."""
-    prediction = Prediction(centerlines=CenterlinePrediction(lines, np.zeros((len(lines), 1)), logit(learned)))
-    changed = with_geometric_topology(prediction).centerlines
-    np.testing.assert_array_equal(changed.points, lines)
-    assert np.isfinite(changed.successor_logits).all()
-    return expit(changed.successor_logits), learned + geometric_edges(lines)
+def prediction(lines, learned):
+    return CenterlinePrediction(lines, np.zeros((len(lines), 1)), None if learned is None else logit(learned))
 
 
-def test_sums_keep_their_order_and_the_threshold():
+def test_confidences_are_the_sums_that_topologic_evaluates():
     learned = expit(np.array([[-3.0, 2.0, -9.0], [-9.0, -3.0, 0.5], [-9.0, -9.0, -3.0]]))
-    found, both = confidences(CHAIN, learned)
-    expected = np.where(both <= 0.5, both, 0.5 + (both - 0.5) / 3)
-    np.testing.assert_allclose(found, expected, atol=1e-6)
-    assert both.max() > 1.0
-    assert found.max() < 1.0
-    np.testing.assert_array_equal(found > 0.5, both > 0.5)
-    np.testing.assert_array_equal(np.argsort(found, None, "stable"), np.argsort(both, None, "stable"))
+    found = edge_confidences(CHAIN, logit(learned), "geometric")
+    np.testing.assert_allclose(found, learned + geometric_edges(CHAIN), atol=1e-9)
+    assert found.max() > 1.0
+    np.testing.assert_allclose(edge_confidences(CHAIN, logit(learned)), learned, atol=1e-9)
 
 
 def test_of_two_near_lanes_the_learned_score_decides():
@@ -66,14 +61,29 @@ def test_of_two_near_lanes_the_learned_score_decides():
     fork = lanes(((0, 0, 0), (10, 0, 0)), ((10.2, 0, 0), (20, 5, 0)), ((10.2, 0.1, 0), (20, 0, 0)))
     learned = np.full((3, 3), 0.05)
     learned[0, 1:] = 0.2, 0.9
-    found, both = confidences(fork, learned)
-    assert both[0, 1] > 1.0
+    found = edge_confidences(fork, logit(learned), "geometric")
     true = np.zeros((3, 3), bool)
     true[0, 2] = True
-    assert vertex_average_precision(true, found)[0] == vertex_average_precision(true, both)[0] == 1.0
-    assert found[0, 1] > 0.5
+    assert vertex_average_precision(true, found)[0] == 1.0
 
 
-def test_without_topology_nothing_changes():
-    prediction = Prediction(centerlines=CenterlinePrediction(CHAIN, np.zeros((3, 1)), None))
-    assert with_geometric_topology(prediction).centerlines is prediction.centerlines
+@pytest.mark.parametrize(("version", "without"), [("v2.1", 1 / 4), ("v1.0", 1 / 12)])
+def test_an_edge_above_one_ranks_before_those_that_the_program_assumes(version, without):
+    """Regression: sums were brought below 1, where v1.0 ranks them behind the false edges of unmatched lanes.
+
+    Of four true lanes in a row, the first two are found, and their edge: two of eight vertices. In v1.0 the false edges
+    from and to the other lanes have confidence 1, two at each of these vertices.
+    """
+    row = lanes(*(((10 * i, 0, 0), (10 * i + 10, 0, 0)) for i in range(4)))
+    truth = LaneTruth(row, np.eye(4, k=1, dtype=bool))
+    found = prediction(row[:2], np.array([[1e-3, 0.6], [1e-3, 1e-3]]))
+    for topology, expected in (("learned", without), ("geometric", 1 / 4)):
+        metrics = CenterlineMetrics((version,))
+        metrics.update(detections_of_centerlines(found, topology=topology), truth)
+        assert metrics.compute()["TOP_ll"] == pytest.approx(expected)
+
+
+def test_without_predicted_topology_geometry_adds_none():
+    for topology in ("learned", "geometric"):
+        found = detections_of_centerlines(prediction(CHAIN, None), topology=topology)
+        np.testing.assert_array_equal(found.successor, np.zeros((3, 3)))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tflane_jax.errors import UserError
-from tflane_jax.metrics import MapDetections, MapTruth
+from tflane_jax.metrics import MapDetections, MapTruth, VectorMapMetrics
 from tflane_jax.metrics.consistency import MapConsistency
 from tflane_jax.metrics.map_matching import MAP_THRESHOLDS, match_map
 
@@ -65,6 +65,22 @@ def test_pieces_of_one_line_may_be_found_under_several_identities():
     pieces = [(0, 7), (5, 7)]
     found = [(0, 0.9, 1), (5, 0.8, 2)]
     assert run([(pieces, found), (pieces, found)])["C-AP_divider"] == 1.0
+
+
+def test_a_class_that_a_sample_lacks_does_not_count():
+    """Regression: it counted as AP 0 in C-mAP, though not in MapTR's mAP."""
+    metrics, same = MapConsistency(), VectorMapMetrics("maptr")
+    for classes in (0, 1):  # a scene of one frame with dividers, and one with crossings
+        found = MapDetections([line(0)], np.array([classes]), np.array([0.9]))
+        true = MapTruth([line(0)], np.array([classes]))
+        metrics.start()
+        metrics.add(match_map(found, true), np.array([1]), np.array([7]))
+        same.update(found, true)
+    weights = np.array([[1, 1], [2, 0], [0, 2]])
+    samples = metrics.bootstrap(weights)["C-mAP"]
+    # No frame has a boundary: that class counts as 0 everywhere, as in the whole.
+    np.testing.assert_allclose(samples, [metrics.compute()["C-mAP"], 1 / 2, 1 / 2])
+    np.testing.assert_array_equal(samples, same.bootstrap(weights)["mAP"])
 
 
 def test_one_identity_for_two_lines_is_no_error():

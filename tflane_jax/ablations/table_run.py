@@ -256,8 +256,9 @@ def _add_geometric(trained: Mapping[str, Sequence[Job]], results: Results) -> No
         for evaluation in job.further:
             measured = measure(job, replace(job.config, evaluation=evaluation), "last")
             if measured is not None:
-                for score in TOPOLOGY & scores.keys():
-                    scores[score + GEOMETRIC] = measured.ways[""][score]
+                found = measured.ways[""]  # of earlier programs without those of v1.0, which had been wrong
+                for score in TOPOLOGY & scores.keys() & found.keys():
+                    scores[score + GEOMETRIC] = found[score]
 
 
 def _save_scores(table: PaperTable, results: Results, folder: Path, *, quick: bool) -> Path:

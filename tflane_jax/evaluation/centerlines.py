@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Int
 from scipy.special import expit
 
+from tflane_jax.evaluation.geometric_topology import Topology, edge_confidences
 from tflane_jax.metrics.frames import ElementDetections, ElementTruth, LaneDetections, LaneTruth
 from tflane_jax.scene import CenterlinePrediction, ElementPrediction, LaneGraph, TrafficElements
 
@@ -35,20 +36,20 @@ def truth_of_centerlines(lanes: LaneGraph, elements: TrafficElements | None = No
 
 
 def detections_of_centerlines(
-    prediction: CenterlinePrediction, elements: ElementPrediction | None = None
+    prediction: CenterlinePrediction, elements: ElementPrediction | None = None, topology: Topology = "learned"
 ) -> LaneDetections:
     """Return the lanes (and traffic elements) of all queries of ONE example's last layer, best score first.
 
-    All queries are kept, whatever their score. Without predicted topology, all edges have confidence 0. A traffic
-    element gets the attribute with the highest score.
+    All queries are kept, whatever their score. Without predicted topology, all edges have confidence 0, and otherwise
+    that of `geometric_topology.edge_confidences`. A traffic element gets the attribute with the highest score.
     """
     scores = expit(np.asarray(prediction.logits)).max(-1)
     order = np.argsort(-scores, kind="stable")
-    edges = prediction.successor_logits
+    edges = edge_confidences(np.asarray(prediction.points), prediction.successor_logits, topology)
     return LaneDetections(
         points=np.asarray(prediction.points)[order],
         scores=scores[order],
-        successor=np.zeros((len(order),) * 2) if edges is None else expit(np.asarray(edges)[np.ix_(order, order)]),
+        successor=edges[np.ix_(order, order)],
         elements=None if elements is None else detections_of_elements(elements, order),
     )
 

@@ -24,7 +24,7 @@ from tflane_jax.datasets.batches import ordered_batches
 from tflane_jax.datasets.streaming import Streamed
 from tflane_jax.evaluation.by_scene import counted_ratio, scene_numbers, shared_samples, summed_ratio
 from tflane_jax.evaluation.centerlines import detections_of_centerlines, truth_of_centerlines
-from tflane_jax.evaluation.geometric_topology import with_geometric_topology
+from tflane_jax.evaluation.geometric_topology import Topology
 from tflane_jax.evaluation.interventions import with_traffic
 from tflane_jax.evaluation.lane_groups import LANE_GROUPS, lane_groups, line_groups
 from tflane_jax.evaluation.lane_segments import detections_of_segments, truth_of_segments
@@ -63,6 +63,7 @@ class LaneGraphMetrics:
             `metrics.groups.GroupedMetrics`.
         parts: predicted parts that are measured as long as no frame was seen.
         map_measures, line_labels, line_dims: of the lines of vector maps, see `MapLineMetrics`.
+        topology: confidences of edges, see `geometric_topology.edge_confidences`.
     """
 
     def __init__(
@@ -74,6 +75,7 @@ class LaneGraphMetrics:
         map_measures: Sequence[Measure] = ("chamfer",),
         line_labels: Sequence[LineLabel] = (),
         line_dims: Dims = 2,
+        topology: Topology = "learned",
     ) -> None:
         grouped = partial(GroupedMetrics, frame_groups=frame_groups, lane_groups=lane_groups)
         self._centerlines = grouped(partial(CenterlineMetrics, versions))
@@ -84,6 +86,7 @@ class LaneGraphMetrics:
             map_measures, line_labels, lane_groups if line_labels else (), line_dims, frame_groups
         )
         self._measured = tuple(parts)
+        self._topology: Topology = topology
 
     @property
     def protocol(self) -> str:
@@ -118,12 +121,13 @@ class LaneGraphMetrics:
         found, true = (prediction.elements, example.traffic_elements) if both else (None, None)
         members = members or {}
         if prediction.centerlines is not None:
-            detections = detections_of_centerlines(prediction.centerlines, found)
+            detections = detections_of_centerlines(prediction.centerlines, found, self._topology)
             lanes = truth_of_centerlines(example.lanes, true)
             self._centerlines.update(detections, lanes, frame_group, members.get("centerlines"))
         if prediction.segments is not None:
             segments = truth_of_segments(example.segments, example.areas, true, example.lanes)
-            frame = match_segments(detections_of_segments(prediction.segments, found), segments, nearest="all")
+            detected = detections_of_segments(prediction.segments, found, self._topology)
+            frame = match_segments(detected, segments, nearest="all")
             self._segments.add(frame, segments, frame_group, members.get("segments"))
             self._devkit.add(frame)
         if prediction.lines is not None:
@@ -247,11 +251,10 @@ def evaluate_lanes(
                 map_measures=config.map_measures,
                 line_labels=line_labels(batch.map_lines),
                 line_dims=_line_dims(batch, answer),
+                topology=config.topology,
             )
         for row in range(len(indices)):
             prediction, example = jax.tree.map(lambda leaf, i=row: leaf[i], (answer, _labels(batch)))
-            if config.topology == "geometric":
-                prediction = with_geometric_topology(prediction)
             groups = [frame_groups[int(indices[row])]] if frame_groups else []
             if batch.markers is not None:
                 groups.append(sightings.next(batch.markers.valid[row].any(), batch.has_previous[row]))

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.special import expit
 
 from tflane_jax.evaluation.centerlines import detections_of_elements
+from tflane_jax.evaluation.geometric_topology import Topology, edge_confidences
 from tflane_jax.metrics.frames import ElementDetections, ElementTruth, LaneDetections, LaneTruth
 from tflane_jax.metrics.segment_matching import CROSSING, AreaDetections, AreaTruth, SegmentDetections, SegmentTruth
 from tflane_jax.scene import (
@@ -114,10 +115,15 @@ def segment_detections(
     )
 
 
-def detections_of_segments(segments: SegmentPrediction, elements: ElementPrediction | None = None) -> SegmentDetections:
-    """Return the last decoder layer's segments of one example, and its areas, see `segment_detections`."""
+def detections_of_segments(
+    segments: SegmentPrediction, elements: ElementPrediction | None = None, topology: Topology = "learned"
+) -> SegmentDetections:
+    """Return the last decoder layer's segments of one example, and its areas, see `segment_detections`.
+
+    Confidences of edges are those of `geometric_topology.edge_confidences`.
+    """
     confidence = expit(np.asarray(segments.logits))
-    edges, types = segments.successor_logits, (segments.left_type_logits, segments.right_type_logits)
+    types = segments.left_type_logits, segments.right_type_logits
     left_type, right_type = (None if logits is None else np.asarray(logits).argmax(-1) for logits in types)
     detections = segment_detections(
         np.asarray(segments.points),
@@ -125,7 +131,7 @@ def detections_of_segments(segments: SegmentPrediction, elements: ElementPredict
         np.asarray(segments.right),
         confidence.argmax(-1),
         confidence.max(-1),
-        np.zeros((len(confidence),) * 2) if edges is None else expit(np.asarray(edges)),
+        edge_confidences(np.asarray(segments.points), segments.successor_logits, topology),
         elements=None if elements is None else detections_of_elements(elements),
         left_type=left_type,
         right_type=right_type,

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
+from tflane_jax.evaluation.geometric_topology import Topology
 from tflane_jax.limits import DIFFERENT, NOT_EMPTY, Count, CountOrZero
 from tflane_jax.metrics.groups import COUNTS, shown_of_part
 from tflane_jax.metrics.map_matching import Measure
@@ -14,9 +15,6 @@ from tflane_jax.metrics.topology import Version
 
 Traffic = Literal["own", "none", "other-scene"]
 """Traffic flow at inference: that of the frame, none, or that of a frame of another scene."""
-
-Topology = Literal["learned", "geometric"]
-"""Edges between lanes at evaluation: as predicted, or with TopoLogic's geometric score added."""
 
 
 @dataclass(frozen=True)

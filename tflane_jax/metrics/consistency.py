@@ -25,6 +25,7 @@ from tflane_jax.metrics.frames import check_shape
 from tflane_jax.metrics.map_matching import CLASSES, MAP_THRESHOLDS, MatchedMap
 from tflane_jax.metrics.matching import average_precision_area, pooled
 from tflane_jax.metrics.merging import by_frame
+from tflane_jax.metrics.vector_map import counted_in_sample, mean_precision
 
 CONFIDENT = 0.4
 
@@ -91,7 +92,10 @@ class MapConsistency:
         return {name: float(value) for name, value in means.items()}
 
     def bootstrap(self, weights: Weights) -> dict[str, Float[np.ndarray, " b"]]:
-        """Return the numbers of `compute` in samples that count the frames of a scene equally often, see `weights`."""
+        """Return the numbers of `compute` in samples that count the frames of a scene equally often, see `weights`.
+
+        As in MapTR's mAP, a C-AP that a sample lacks is 0, and does not count in its `C-mAP`.
+        """
         scores, classes, hits = pooled(self._detections, (0,), (len(MAP_THRESHOLDS), 0))
         frame, truths = frame_numbers(self._detections), by_frame(self._frame_truths, (len(CLASSES),), int)
         precision = {}
@@ -99,4 +103,5 @@ class MapConsistency:
             own = classes == c
             _, area = bootstrap_precisions(scores[own], hits[:, own], frame[own], truths[:, c], weights)
             precision[f"C-AP_{name}"] = area.mean(1)
-        return {"C-mAP": np.mean(list(precision.values()), axis=0)} | precision
+        counted = counted_in_sample((weights @ truths).T, truths.sum(0)[:, None], "all")
+        return {"C-mAP": mean_precision(np.stack(list(precision.values()))[:, None], counted)} | precision

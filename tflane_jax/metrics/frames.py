@@ -130,7 +130,7 @@ def checked_edges(edges: Any, shape: tuple[int, ...], what: str) -> Bool[np.ndar
 def checked_confidence(confidence: Any, shape: tuple[int, ...], what: str) -> Float[np.ndarray, "a b"]:
     """Return confidences of relations; raise UserError for another shape or negative numbers, such as logits.
 
-    They may exceed 1, as sums do: only their order counts, and which exceed 0.5.
+    They may exceed 1, as sums do: their order counts, which exceed 0.5, and in OpenLane-V2's v1.0 which exceed 1.
     """
     confidence = np.asarray(confidence)
     check_shape(confidence, shape, what)

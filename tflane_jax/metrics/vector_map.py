@@ -111,7 +111,7 @@ class VectorMapMetrics:
 
         A class that the test set has and the sample lacks is left out: 0, as officially, would be the luck of the draw.
         """
-        return self._numbers(_counted_in_sample(self._truths.sum(0), whole._truths.sum(0), "all"))
+        return self._numbers(counted_in_sample(self._truths.sum(0), whole._truths.sum(0), "all"))
 
     def _numbers(self, counted: Bool[np.ndarray, "4"]) -> dict[str, float]:
         thresholds, truths = self.thresholds, self._truths.sum(0)
@@ -126,7 +126,7 @@ class VectorMapMetrics:
         mean, at_threshold = {}, {}
         if precision:
             table = np.array(list(precision.values()))
-            mean["mAP"] = float(_mean_precision(table, np.ones(len(table), bool)))
+            mean["mAP"] = float(mean_precision(table, np.ones(len(table), bool)))
             present = max((truths > 0).sum(), 1)
             at_threshold = {f"mAP@{t}": float(p) for t, p in zip(thresholds, table.sum(0) / present, strict=True)}
         return (
@@ -156,8 +156,8 @@ class VectorMapMetrics:
             precision[f"AP_{LINE_CLASSES[c]}"] = area.mean(1)
         if not precision:
             return {}
-        counted = _counted_in_sample((weights @ truths).T, truths.sum(0)[:, None], scope)[measured]
-        return {"mAP": _mean_precision(np.stack(list(precision.values()))[:, None], counted)} | precision
+        counted = counted_in_sample((weights @ truths).T, truths.sum(0)[:, None], scope)[measured]
+        return {"mAP": mean_precision(np.stack(list(precision.values()))[:, None], counted)} | precision
 
     @property
     def _truths(self) -> Int[np.ndarray, "f 4"]:
@@ -165,7 +165,7 @@ class VectorMapMetrics:
         return by_frame(self._frame_truths, (len(LINE_CLASSES),), int)
 
 
-def _counted(truths: Int[np.ndarray, "4 *b"], scope: Scope) -> Bool[np.ndarray, "4 *b"]:
+def _counted(truths: Int[np.ndarray, "c *b"], scope: Scope) -> Bool[np.ndarray, "c *b"]:
     """Return which classes count in mAP: those with true lines, and in the whole test set all but centerlines."""
     counted = truths > 0
     if scope == "all":
@@ -173,14 +173,14 @@ def _counted(truths: Int[np.ndarray, "4 *b"], scope: Scope) -> Bool[np.ndarray, 
     return counted
 
 
-def _counted_in_sample(
-    truths: Int[np.ndarray, "4 *b"], whole: Int[np.ndarray, "4 *#b"], scope: Scope
-) -> Bool[np.ndarray, "4 *b"]:
+def counted_in_sample(
+    truths: Int[np.ndarray, "c *b"], whole: Int[np.ndarray, "c *#b"], scope: Scope
+) -> Bool[np.ndarray, "c *b"]:
     """Return which classes of `_counted` count in a sample: not those of the whole test set that the sample lacks."""
     return _counted(truths, scope) & ((truths > 0) | (whole == 0))
 
 
-def _mean_precision(
+def mean_precision(
     precision: Float[np.ndarray, "c k *b"], counted: Bool[np.ndarray, "c *b"]
 ) -> Float[np.ndarray, "*b"]:
     """Return the mean over the counted classes and over the thresholds; 0 where no class counts."""

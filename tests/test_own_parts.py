@@ -102,6 +102,21 @@ def test_an_own_part_is_checked_changed_and_read_back(name):
         apply_overrides(config, [f"--{name}.{own}", "x"])
 
 
+def test_a_derived_class_keeps_what_is_set():
+    """Regression: an own prior switched the shipped ones off, and an own encoder had the shipped default size."""
+    model = replace(RunConfig().task.model, priors=PriorsConfig(traffic_flow=TrafficFlowConfig(insert="every_layer")))
+    config = with_setting(RunConfig(), "task.model", model)
+    config = with_setting(config, "task.model.encoder", replace(model.encoder, dim=96))
+    changed = apply_overrides(
+        config, ["--task.model.priors", "MapPriorsConfig", "--task.model.encoder", "PlainEncoderConfig"]
+    )
+    assert changed.task.model.priors == MapPriorsConfig(traffic_flow=TrafficFlowConfig(insert="every_layer"))
+    assert changed.task.model.encoder == PlainEncoderConfig(dim=96)
+    assert apply_overrides(config, ["--task.model.priors.traffic_flow", "None"]).task.model.priors == PriorsConfig()
+    again = apply_overrides(config, ["--task.model.priors.traffic_flow", "default"]).task.model.priors
+    assert again == PriorsConfig(traffic_flow=TrafficFlowConfig())
+
+
 def chosen(name: str, kind: type) -> list[str]:
     more = [f"--{name}.crossings", "default"] if kind is MapPriorsConfig else []
     return [f"--{name}", kind.__name__, *more]

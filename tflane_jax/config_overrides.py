@@ -7,6 +7,7 @@ import dataclasses
 import difflib
 import io
 import itertools
+import operator
 import re
 import typing
 from collections.abc import Iterable, Sequence
@@ -39,7 +40,8 @@ def apply_overrides(config: RunConfig, arguments: Sequence[str]) -> RunConfig:
     the numbers of updates that `training.same_examples` divides where the arguments do not set them.
 
     An argument that chooses an optional part, or the class of a part, is applied first, wherever it appears:
-    `--a.b None`, `--a.b default` or `--a.b NameOfItsClass`; the part then has its defaults.
+    `--a.b None`, `--a.b default` or `--a.b NameOfItsClass`; the part then has its defaults. A class that is derived
+    from the present one keeps what is set there and is not the default.
 
     Raises:
         UserError: an unknown setting (with the names closest to it), a value of the wrong type, or one that breaks a
@@ -128,10 +130,24 @@ def _choose_parts(config: RunConfig, arguments: Sequence[str]) -> tuple[RunConfi
                 f"setting --{name} takes {', '.join(kinds)}, not {value!r}; its own settings are --{name}...{own}"
             )
         try:
-            config = with_setting(config, name, kinds[value]())
+            config = with_setting(config, name, _chosen(kinds[value], config, name, keep=value != "default"))
         except TypeError:
             raise UserError(f"{value} has no defaults for all of its settings: choose it in a config file") from None
     return config, left
+
+
+def _chosen(kind: type, config: RunConfig, name: str, *, keep: bool) -> Any:
+    """Return a part with its defaults, or with `keep` and a class derived from the present one, with its settings.
+
+    Those are the settings of the present part that are not its class's defaults, so that an own loss by argument is
+    compared with the tuned one.
+    """
+    present = operator.attrgetter(name)(config)
+    if not keep or present is None or not issubclass(kind, type(present)):
+        return kind()
+    usual, names = type(present)(), [field.name for field in dataclasses.fields(present) if field.init]
+    changed = {name: getattr(present, name) for name in names if getattr(present, name) != getattr(usual, name)}
+    return kind(**changed)
 
 
 def _setting(argument: str) -> str:

@@ -17,6 +17,7 @@ import importlib.util
 import os
 import shlex
 import sys
+import sysconfig
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import ModuleType
@@ -119,15 +120,17 @@ def _importable(module: str) -> str:
 
 
 def own_content(config: Any) -> str:
-    """Return the hash of the files that define a configuration's own classes; "" where all are the package's."""
-    modules = sorted({kind.__module__ for kind in _classes(config) if _is_own(kind)})
+    """Return the hash of a configuration's own modules; "" where all its classes are the package's.
+
+    They are those that define its own classes, and the modules of the user's that these import.
+    """
+    modules = sorted(_own_modules(config))
     return hashlib.sha256("".join(map(_content, modules)).encode()).hexdigest() if modules else ""
 
 
 def own_code(config: Any) -> str:
-    """Return the hash of the code that defines a configuration's own classes, wherever the files lie; "" for none."""
-    modules = {kind.__module__ for kind in _classes(config) if _is_own(kind)}
-    hashes = sorted(filter(None, map(_code_of, modules)))
+    """Return the hash of the code of a configuration's own modules, wherever their files lie; "" for none."""
+    hashes = sorted(filter(None, map(_code_of, _own_modules(config))))
     return hashlib.sha256("".join(hashes).encode()).hexdigest() if hashes else ""
 
 
@@ -144,6 +147,34 @@ def _content(module: str) -> str:
     if module.startswith(_PREFIX):  # its name does
         return module
     return _code_of(module)
+
+
+def _own_modules(config: Any) -> set[str]:
+    """Return the modules that define a configuration's own classes, and all of the user's that they import from."""
+    left, found = [kind.__module__ for kind in _classes(config) if _is_own(kind)], set()
+    while left:
+        if (name := left.pop()) not in found:
+            found.add(name)
+            values = vars(sys.modules.get(name, object)).values()
+            named = {
+                one.__name__ if isinstance(one, ModuleType) else getattr(one, "__module__", None) for one in values
+            }
+            left += [other for other in named if isinstance(other, str) and _is_users(other)]
+    return found
+
+
+@functools.cache
+def _is_users(module: str) -> bool:
+    """Return whether a module is a file of the user: no part of this package, and not installed."""
+    file = getattr(sys.modules.get(module), "__file__", None)
+    if file is None or module.partition(".")[0] == __name__.partition(".")[0]:
+        return False
+    return not any(Path(file).is_relative_to(folder) for folder in _installed())
+
+
+@functools.cache
+def _installed() -> tuple[str, ...]:
+    return tuple({sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib")})
 
 
 def _is_own(kind: type) -> bool:

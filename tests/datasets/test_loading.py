@@ -136,12 +136,25 @@ class AbsentAtFirst(Changed):
     place = 0
 
 
+class IntegerMask(Misfit):
+    def changed(self, example: Example) -> Example:
+        return example.replace(lanes=example.lanes.replace(valid=np.asarray(example.lanes.valid, np.uint8)))
+
+
+class OnAMap(Misfit):
+    def changed(self, example: Example) -> Example:
+        lanes = example.lanes
+        return example.replace(lanes=lanes.replace(points=np.asarray(lanes.points) + np.float32(345_678.0)))
+
+
 @pytest.mark.parametrize(
     ("kind", "said"),
     [
         (Changed, r"traffic_flow\.\w+ is absent in example 2 and \w+ of shape .* in example 0"),
         (AbsentAtFirst, r"traffic_flow\.\w+ is \w+ of shape .* in example 1 and absent in example 0"),
         (Converted, "bev is float32 of shape .* in example 2 and uint8 of shape"),
+        (IntegerMask, r"in example 0, lanes\.valid is uint8, expected bool"),
+        (OnAMap, r"lanes of example 0 reach 346 km from the vehicle: their points must be in its own frame in metres"),
         (Misfit, r"in example 0, lanes\.successor is of shape \(3, 3\), expected"),
     ],
 )

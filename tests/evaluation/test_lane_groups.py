@@ -166,6 +166,15 @@ def test_what_counts_as_evidence(channel, value, group):
     assert members(straight_lanes(0.0), bev, TrafficFlow.empty(1, 3))[0][0] == f"{group}-traffic"
 
 
+def test_a_lane_without_boundaries_is_in_no_group():
+    """Regression: boundaries that nobody had filled in were looked for at the vehicle."""
+    bev, lanes = raster(), straight_lanes(0.0, 6.0)
+    bev[:, :, BevChannel.LANE_PAINT] = 200
+    assert [len(of_lane) for of_lane in members(lanes, bev, TrafficFlow.empty(1, 3))] == [1, 1]
+    lanes.left[3] = lanes.right[3] = 0.0
+    assert [len(of_lane) for of_lane in members(lanes, bev, TrafficFlow.empty(1, 3))] == [1, 0]
+
+
 def test_a_frame_without_lanes_has_empty_groups():
     groups = lane_groups(LaneGraph.empty(3, 5), raster(), driving(10.0, 0.0), GROUND)
     assert {name: len(group) for name, group in groups.items()} == dict.fromkeys(LANE_GROUPS, 0)

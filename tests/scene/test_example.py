@@ -71,6 +71,30 @@ def test_the_field_of_a_wrong_shape_is_named(path, shape):
         wrong.validate()
 
 
+@pytest.mark.parametrize(
+    ("path", "kind", "said"),
+    [
+        ("bev", np.float32, "is float32, expected uint8"),
+        ("lanes.valid", np.uint8, "is uint8, expected bool"),
+        ("lanes.points", np.int64, "is int64, expected float"),
+        ("areas.category", np.float32, "is float32, expected int"),
+        ("areas.category", np.uint8, None),
+        ("lanes.points", np.float16, None),
+    ],
+)
+def test_the_field_of_another_type_is_named(path, kind, said):
+    """Regression: a mask of integers trained, and its evaluation failed; evidence of floats was divided by 255."""
+    example = make_example()
+    owner, _, name = path.rpartition(".")
+    array = np.asarray(getattr(getattr(example, owner) if owner else example, name)).astype(kind)
+    changed = altered(example, path, array)
+    if said is None:
+        changed.validate()
+    else:
+        with pytest.raises(AssertionError, match=rf"^{path} {said}$"):
+            changed.validate()
+
+
 def test_lengths_of_other_fields_are_told():
     lanes = make_example().lanes
     with pytest.raises(AssertionError, match=r"left is of shape \(8, 10, 3\), expected \(8, 11, 3\)"):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import hashlib
 import itertools
 import os
@@ -22,6 +21,7 @@ from tflane_jax.datasets.nuscenes_place import SCENE_TABLE, read_scene, scene_fi
 from tflane_jax.datasets.nuscenes_scene_files import read_scene_file, scene_file_outline
 from tflane_jax.datasets.openlane_maps import map_name, read_segment, segment_files
 from tflane_jax.errors import UserError
+from tflane_jax.files.digests import file_content
 from tflane_jax.files.folders import named_folder
 from tflane_jax.geometry import pose_yaw, transform_points
 from tflane_jax.scene import RoadUser
@@ -60,15 +60,7 @@ class MapFile:
 
     def content(self) -> str:
         """Return the hash of all that the map depends on."""
-        digest = hashlib.sha256(self.name.encode())
-        for file in self.files:
-            try:
-                state = file.stat()
-                content = _digest(file, state.st_size, state.st_mtime_ns)
-            except OSError as error:
-                raise UserError(f"cannot read {file}: {error.strerror or error}") from None
-            digest.update(file.name.encode() + b"\0" + content + b"\0")
-        return digest.hexdigest()
+        return hashlib.sha256(self.name.encode() + b"".join(map(file_content, self.files))).hexdigest()
 
     def log(self) -> Log:
         """Read the log; raise UserError if a file is missing or damaged, or if the map is not that of a log."""
@@ -100,13 +92,6 @@ class MapFile:
 def content_of(maps: Collection[MapFile]) -> str:
     """Return the hash of all that several maps depend on, in their order."""
     return hashlib.sha256("".join(one.content() for one in maps).encode()).hexdigest()
-
-
-@functools.lru_cache(maxsize=4096)
-def _digest(file: Path, size: int, changed_ns: int) -> bytes:
-    """Return the hash of a file; many scenes share the tables and the map of a city, which are large."""
-    with file.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").digest()
 
 
 def map_of_log(folder: Path) -> MapFile:

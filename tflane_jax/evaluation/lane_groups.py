@@ -18,7 +18,8 @@ over `SAMPLES` points, equally spaced along the lane.
 | `visible+traffic`, `visible-traffic` | at least `HALF` | the same |
 | `hidden-neighbours` | below `HALF` | no vehicle came within `NEXT_LANE` of the lane |
 
-Lanes with some traffic, but along less than half of their length, are in none of the first four groups. Lanes of the
+Lanes with some traffic, but along less than half of their length, are in none of the first four groups; lanes whose
+boundaries are not known, both without length, are in none at all. Lanes of the
 control may have traffic in the lane beside them, which indicates them too; `hidden-neighbours`, a subset of the
 control, excludes that, but has few lanes.
 
@@ -67,7 +68,9 @@ def lane_groups(
     center, left, right = (np.asarray(x)[valid] for x in (lanes.points, lanes.left, lanes.right))
     hidden = shown_fraction(left, right, bev, ground) < HALF
     driven, distance = driven_fraction(center, flow)
-    return _groups(hidden, driven >= HALF, distance > NEARBY, distance > NEXT_LANE)
+    bounded = np.concatenate([np.ptp(left, axis=1), np.ptp(right, axis=1)], axis=-1).any(-1)
+    found = _groups(hidden, driven >= HALF, distance > NEARBY, distance > NEXT_LANE)
+    return {name: members & bounded for name, members in found.items()}
 
 
 def line_groups(

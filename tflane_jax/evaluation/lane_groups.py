@@ -19,9 +19,8 @@ over `SAMPLES` points, equally spaced along the lane.
 | `hidden-neighbours` | below `HALF` | no vehicle came within `NEXT_LANE` of the lane |
 
 Lanes with some traffic, but along less than half of their length, are in none of the first four groups; lanes whose
-boundaries are not known, both without length, are in none at all. Lanes of the
-control may have traffic in the lane beside them, which indicates them too; `hidden-neighbours`, a subset of the
-control, excludes that, but has few lanes.
+boundaries are not known, both without length, are in none at all. Lanes of the control may have traffic in the lane
+beside them, which indicates them too; `hidden-neighbours`, a subset of the control, excludes that, but has few lanes.
 
 Lines of a vector map have the same groups (`line_groups`). A line is shown by evidence on itself, a crossing by its
 stripes, a centerline by paint or edges within `HALF_LANE` more. Traffic along a line passes within `HALF_LANE` more and

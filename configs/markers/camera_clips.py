@@ -8,7 +8,8 @@ simulated, except in "pixels": there a detector reads the boards in native image
 the examples. docs/markers.md says which rows are trained.
 
 The hosts pass BEV features from frame to frame, into which Eq. (3) has added the lanes of the boards. So a row without
-memory lacks the bank of markers only, and sees what BEV features keep of an earlier board.
+memory lacks the bank of markers only, and sees what BEV features keep of an earlier board. Rows `alone_...` start from
+a host that passes none.
 """
 
 import functools
@@ -43,6 +44,8 @@ def ablations() -> dict[str, RunConfig]:
     return {name: _tuned(rows[name]) for name in ROWS} | {
         "bevformer_detr": _tuned(rows["toponet"], "bevformer_detr"),
         "pixels": _from_pixels(get_config()),
+        "alone": _tuned(load_config(str(HERE.with_name("toponet_markers.py"))), "alone"),
+        **{f"alone_{name}": _tuned(rows[name], "alone") for name in ("toponet", "no_memory")},
     }
 
 

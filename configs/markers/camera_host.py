@@ -5,9 +5,9 @@
 
 Models and cameras are those of `camera/toponet.py` and `camera/bevformer_detr.py`, with those parts of the recipe of
 docs/small_models.md that a camera model can have: the output in metres and the precision as class target. Those learn
-from single frames; these learn with the memory of BEV features that the rows use, at the frame rate of the paper. One
-host for each seed. The examples hold markers and an SD map, which the hosts ignore, so that all rows use the same
-cached data. Five seeds are trained: docs/cameras.md has their scores.
+from single frames; these learn with the memory of BEV features that the rows use, at the frame rate of the paper;
+`alone` has none, as TopoNet's own program. One host for each seed. The examples hold markers and an SD map, which the
+hosts ignore, so that all rows use the same cached data. Five seeds are trained: docs/cameras.md has their scores.
 """
 
 from dataclasses import replace
@@ -17,7 +17,9 @@ from tflane_jax.config import RunConfig, WorldData, load_config
 from tflane_jax.evaluation.results import EvaluationConfig
 from tflane_jax.losses.toponet import TopoNetLossConfig
 from tflane_jax.markers.simulation import MarkerConfig, MarkerSimulationConfig
+from tflane_jax.models.bev_encoder import BevFormerConfig
 from tflane_jax.models.bevformer_detr import BevFormerDetrConfig
+from tflane_jax.models.camera_encoder import CameraEncoderConfig
 from tflane_jax.models.toponet import TopoNetConfig
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.world.roads.markers import PlacementConfig
@@ -36,8 +38,18 @@ def get_config() -> RunConfig:
 
 
 def ablations() -> dict[str, RunConfig]:
-    """Return BEVFormer-DETR."""
-    return {"bevformer_detr": _on_clips("bevformer_detr")}
+    """Return BEVFormer-DETR, and TopoNet without memory of BEV features."""
+    return {"bevformer_detr": _on_clips("bevformer_detr"), "alone": _alone(get_config())}
+
+
+def _alone(config: RunConfig) -> RunConfig:
+    """Return a training whose frames have BEV features of their own images alone."""
+    assert isinstance(config.task, LaneGraphTask)
+    encoder = config.task.model.encoder
+    assert isinstance(encoder, CameraEncoderConfig)
+    assert isinstance(encoder.bev, BevFormerConfig)
+    model = replace(config.task.model, encoder=replace(encoder, bev=replace(encoder.bev, memory="off")))
+    return replace(config, task=replace(config.task, model=model))
 
 
 def _on_clips(name: str) -> RunConfig:

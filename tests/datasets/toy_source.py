@@ -38,7 +38,7 @@ class ToyDataset:
         sensor = self.config.example.sensor
         assert sensor is not None
         bev = np.zeros((sensor.grid.rows, sensor.grid.columns, 4), np.uint8)
-        return fake_example(index + 1000 * SPLITS.index(self.config.split)).replace(bev=bev)
+        return fake_example(index + 1000 * SPLITS.index(self.config.split)).replace(bev=bev, hidden=bev[..., 0] > 0)
 
     def info(self, index: int) -> FrameInfo:
         return FrameInfo("toy", f"{self.config.split} scene", index, np.eye(4))

@@ -156,25 +156,27 @@ def _own_modules(config: Any) -> set[str]:
         if (name := left.pop()) not in found:
             found.add(name)
             values = vars(sys.modules.get(name, object)).values()
-            named = {
-                one.__name__ if isinstance(one, ModuleType) else getattr(one, "__module__", None) for one in values
-            }
-            left += [other for other in named if isinstance(other, str) and _is_users(other)]
+            left += [other for other in set(map(_module_of, values)) if _is_users(other)]
     return found
+
+
+def _module_of(value: Any) -> str:
+    """Return the module that a value is, or is defined in; "" where that cannot be told."""
+    if isinstance(value, ModuleType):
+        return value.__name__
+    with contextlib.suppress(Exception):  # objects of the user's may do anything when asked
+        return value.__module__ if isinstance(value.__module__, str) else ""
+    return ""
 
 
 @functools.cache
 def _is_users(module: str) -> bool:
-    """Return whether a module is a file of the user: no part of this package, and not installed."""
+    """Return whether a module is a file of the user: no part of this package, not Python's, and not installed."""
     file = getattr(sys.modules.get(module), "__file__", None)
     if file is None or module.partition(".")[0] == __name__.partition(".")[0]:
         return False
-    return not any(Path(file).is_relative_to(folder) for folder in _installed())
-
-
-@functools.cache
-def _installed() -> tuple[str, ...]:
-    return tuple({sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib")})
+    installed = {"site-packages", "dist-packages"} & set(Path(file).parts)
+    return not installed and not Path(file).is_relative_to(sysconfig.get_path("stdlib"))
 
 
 def _is_own(kind: type) -> bool:

@@ -143,9 +143,11 @@ def _check_first(dataset: Dataset, example: Example) -> None:
 
 
 def _check_frame(dataset: Dataset, index: int, example: Example) -> None:
-    """Raise UserError where lanes of an example are so far away that they cannot be in the frame of the vehicle."""
+    """Raise UserError where lanes of an example are no numbers, or too far away to be in the frame of the vehicle."""
     for name, lanes in (("lanes", example.lanes), ("segments", example.segments)):
         points = np.asarray(lanes.points)[np.asarray(lanes.valid)]
+        if not np.isfinite(points).all():
+            raise UserError(f"{dataset.name}: {name} of example {index} have a point that is not finite")
         if (farthest := np.abs(points).max(initial=0.0)) > FARTHEST_LANE:
             raise UserError(
                 f"{dataset.name}: {name} of example {index} reach {farthest / 1e3:.3g} km from the vehicle: their "

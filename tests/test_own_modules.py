@@ -220,22 +220,41 @@ def test_two_files_do_not_define_one_class(monkeypatch):
     assert own_modules.own_code(edited.VariantLossConfig()) != own_modules.own_code(first.VariantLossConfig())
 
 
-def test_modules_that_an_own_class_needs_are_part_of_its_code():
+READER = """from typing import TYPE_CHECKING
+import numpy
+{imported}
+if TYPE_CHECKING:
+    import json.tool
+
+
+def read():
+    import late{number}
+"""
+
+
+@pytest.mark.parametrize(
+    "imported", ["from helper{0} import FACTOR", "import helper{0} as other", "if True:\n    import helper{0}"]
+)
+def test_modules_that_an_own_class_needs_are_part_of_its_code(imported, request):
     """Regression: after an edit of the reader that a configuration's module imports, kept scores counted as its own."""
-    hashes = []
-    for number, helper in enumerate(("FACTOR = 1", "FACTOR = 2", "FACTOR = 1")):
-        Path(f"helper{number}.py").write_text(helper)
-        Path(f"reader{number}.py").write_text(
-            f"import numpy\nfrom helper{number} import FACTOR as factor\nimport helper{number}\n"
-        )
-        name = f"Needing{number}LossConfig"
+    hashes, case = [], request.node.callspec.indices["imported"]
+    for value in (1, 2):
+        number = f"{case}_{value}"
+        Path(f"late{number}.py").write_text("")
+        Path(f"helper{number}.py").write_text(f"FACTOR = {value}")
+        Path(f"reader{number}.py").write_text(READER.format(imported=imported.format(number), number=number))
+        name = f"Needing{number.title()}LossConfig"
         Path(f"needing{number}.py").write_text(f"{LOSS.format(name=name)}\nimport reader{number}\n")
         module = own_modules.import_file(Path(f"needing{number}.py"))
         config = getattr(module, name)()
-        assert own_modules._own_modules(config) == {module.__name__, f"reader{number}", f"helper{number}"}
-        hashes.append((own_modules._code_of(f"helper{number}"), own_modules.own_content(config)))
-    assert hashes[0][0] == hashes[2][0] != hashes[1][0]
-    assert len({content for _, content in hashes}) == 3
+        needed = {module.__name__, f"reader{number}", f"helper{number}"}
+        assert own_modules._own_modules(config) == needed
+        content = own_modules.own_content(config)
+        sys.modules[f"reader{number}"].read()  # what a function imports changes nothing
+        assert own_modules._own_modules(config) == needed
+        hashes.append((own_modules._code_of(f"helper{number}"), content))
+    assert hashes[0][0] != hashes[1][0]
+    assert hashes[0][1] != hashes[1][1]
 
 
 def test_the_own_loss_of_the_page_adds_its_term(monkeypatch):

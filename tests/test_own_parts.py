@@ -113,6 +113,8 @@ def test_a_derived_class_keeps_what_is_set():
     assert changed.task.model.priors == MapPriorsConfig(traffic_flow=TrafficFlowConfig(insert="every_layer"))
     assert changed.task.model.encoder == PlainEncoderConfig(dim=96)
     assert apply_overrides(config, ["--task.model.priors.traffic_flow", "None"]).task.model.priors == PriorsConfig()
+    shipped = apply_overrides(config, ["--task.model.encoder", "EvidenceEncoderConfig"])
+    assert shipped.task.model.encoder == EvidenceEncoderConfig()
     again = apply_overrides(config, ["--task.model.priors.traffic_flow", "default"]).task.model.priors
     assert again == PriorsConfig(traffic_flow=TrafficFlowConfig())
 

@@ -311,5 +311,5 @@ def test_processes_with_other_settings_or_code_are_told(monkeypatch):
     with pytest.raises(UserError, match=r"not those of the first process \(optim\.lr: 0\.5 there, .* here\)"):
         agree_on_settings(config)
     first_has(code="another")
-    with pytest.raises(UserError, match="own classes have other code than those of the first process"):
+    with pytest.raises(UserError, match="own modules have other code than those of the first process"):
         agree_on_settings(config)

@@ -17,6 +17,7 @@ from tflane_jax.config import RunConfig, with_reference_batch, with_same_example
 from tflane_jax.config_io import choices, settings, with_setting
 from tflane_jax.errors import UserError
 from tflane_jax.limits import check_settings
+from tflane_jax.own_modules import is_own
 
 # Settings by their names in other programs.
 _SYNONYMS = {
@@ -40,8 +41,8 @@ def apply_overrides(config: RunConfig, arguments: Sequence[str]) -> RunConfig:
     the numbers of updates that `training.same_examples` divides where the arguments do not set them.
 
     An argument that chooses an optional part, or the class of a part, is applied first, wherever it appears:
-    `--a.b None`, `--a.b default` or `--a.b NameOfItsClass`; the part then has its defaults. A class that is derived
-    from the present one keeps what is set there and is not the default.
+    `--a.b None`, `--a.b default` or `--a.b NameOfItsClass`; the part then has its defaults. A class of the user
+    that is derived from the present one keeps what is set there and is not the default.
 
     Raises:
         UserError: an unknown setting (with the names closest to it), a value of the wrong type, or one that breaks a
@@ -137,13 +138,13 @@ def _choose_parts(config: RunConfig, arguments: Sequence[str]) -> tuple[RunConfi
 
 
 def _chosen(kind: type, config: RunConfig, name: str, *, keep: bool) -> Any:
-    """Return a part with its defaults, or with `keep` and a class derived from the present one, with its settings.
+    """Return a part with its defaults.
 
-    Those are the settings of the present part that are not its class's defaults, so that an own loss by argument is
-    compared with the tuned one.
+    With `keep`, a class of the user that is derived from the present one takes the settings of the present part that
+    are not its class's defaults, so that an own loss by argument is compared with the tuned one.
     """
     present = operator.attrgetter(name)(config)
-    if not keep or present is None or not issubclass(kind, type(present)):
+    if not keep or present is None or kind is type(present) or not is_own(kind) or not issubclass(kind, type(present)):
         return kind()
     usual, names = type(present)(), [field.name for field in dataclasses.fields(present) if field.init]
     changed = {name: getattr(present, name) for name in names if getattr(present, name) != getattr(usual, name)}

@@ -6,6 +6,7 @@ found by `sys.path`, which they inherit, and files by TFLANE_FILES.
 
 from __future__ import annotations
 
+import ast
 import contextlib
 import dataclasses
 import functools
@@ -106,7 +107,7 @@ def imports_of(config: Any) -> str:
     Args:
         config: a dataclass, whose settings may be dataclasses of the user.
     """
-    found = dict.fromkeys(_importable(kind.__module__) for kind in _classes(config) if _is_own(kind))
+    found = dict.fromkeys(_importable(kind.__module__) for kind in _classes(config) if is_own(kind))
     return "".join(f" --import {shlex.quote(name)}" for name in found)
 
 
@@ -122,7 +123,7 @@ def _importable(module: str) -> str:
 def own_content(config: Any) -> str:
     """Return the hash of a configuration's own modules; "" where all its classes are the package's.
 
-    They are those that define its own classes, and the modules of the user's that these import.
+    They are those that define its own classes, and the modules of the user's that these import (`_own_modules`).
     """
     modules = sorted(_own_modules(config))
     return hashlib.sha256("".join(map(_content, modules)).encode()).hexdigest() if modules else ""
@@ -150,23 +151,45 @@ def _content(module: str) -> str:
 
 
 def _own_modules(config: Any) -> set[str]:
-    """Return the modules that define a configuration's own classes, and all of the user's that they import from."""
-    left, found = [kind.__module__ for kind in _classes(config) if _is_own(kind)], set()
+    """Return the modules that define a configuration's own classes, and all of the user's that they import at once.
+
+    What a function imports when it is called is left out, because it is known only then.
+    """
+    left, found = [kind.__module__ for kind in _classes(config) if is_own(kind)], set()
     while left:
         if (name := left.pop()) not in found:
             found.add(name)
-            values = vars(sys.modules.get(name, object)).values()
-            left += [other for other in set(map(_module_of, values)) if _is_users(other)]
+            left += filter(_is_users, _imports(name))
     return found
 
 
-def _module_of(value: Any) -> str:
-    """Return the module that a value is, or is defined in; "" where that cannot be told."""
-    if isinstance(value, ModuleType):
-        return value.__name__
-    with contextlib.suppress(Exception):  # objects of the user's may do anything when asked
-        return value.__module__ if isinstance(value.__module__, str) else ""
-    return ""
+@functools.cache
+def _imports(module: str) -> tuple[str, ...]:
+    """Return the names that the import statements of a module may mean as modules; of functions in it, none."""
+    file = getattr(sys.modules.get(module), "__file__", None)
+    if file is None:
+        return ()
+    try:
+        tree = ast.parse(Path(file).read_bytes())
+    except (OSError, SyntaxError, ValueError):  # edited since, or no source
+        return ()
+    found, left, package = set[str](), list[ast.AST](tree.body), sys.modules[module].__package__ or ""
+    while left:
+        node = left.pop()
+        if isinstance(node, ast.Import):
+            found |= {name.rsplit(".", n)[0] for name in (one.name for one in node.names) for n in range(9)}
+        elif isinstance(node, ast.ImportFrom):
+            base = "." * node.level + (node.module or "")
+            base = importlib.util.resolve_name(base, package) if not node.level or package else ""
+            found |= {base, *(f"{base}.{one.name}" for one in node.names)}
+        elif not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda) and not _for_types(node):
+            left += ast.iter_child_nodes(node)
+    return tuple(sorted(found))
+
+
+def _for_types(node: ast.AST) -> bool:
+    """Return whether a statement is `if TYPE_CHECKING:`, whose imports happen only where somebody else makes them."""
+    return isinstance(node, ast.If) and ast.unparse(node.test).endswith("TYPE_CHECKING")
 
 
 @functools.cache
@@ -179,7 +202,8 @@ def _is_users(module: str) -> bool:
     return not installed and not Path(file).is_relative_to(sysconfig.get_path("stdlib"))
 
 
-def _is_own(kind: type) -> bool:
+def is_own(kind: type) -> bool:
+    """Return whether a class is the user's, and none of the package."""
     return kind.__module__.partition(".")[0] != __name__.partition(".")[0]
 
 

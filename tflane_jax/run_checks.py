@@ -30,7 +30,7 @@ EXAMPLE_NAMES = {Example: "lane graphs", RoadImage: "images"}
 
 
 def agree_on_settings(config: RunConfig) -> None:
-    """Raise UserError, in all processes, where one has other settings, or other code of own classes, than the first.
+    """Raise UserError, in all processes, where one has other settings, or other code of own modules, than the first.
 
     Each would take part in every update with a program of its own, or wait for ever for an evaluation of the others.
     """
@@ -42,7 +42,7 @@ def agree_on_settings(config: RunConfig) -> None:
                 f"its settings are not those of the first process ({difference}): give all processes the same command"
             )
         if mine["code"] != first["code"]:
-            raise UserError("its own classes have other code than those of the first process: give all the same files")
+            raise UserError("its own modules have other code than those of the first process: give all the same files")
 
 
 def check_run(config: RunConfig) -> None:

@@ -235,7 +235,7 @@ def test_own_classes_that_were_edited_since_are_told(tiny, tmp_path, capsys):
     before = losses(out / "base" / "seed_0")
     config.write_text(config.read_text() + "# edited\n")
     assert again(config, out) == 0
-    told = f"own classes were edited since they trained {out / 'base' / 'seed_0'}: delete these folders"
+    told = f"own modules were edited since they trained {out / 'base' / 'seed_0'}: delete these folders"
     assert told in capsys.readouterr().err
     assert losses(out / "base" / "seed_0") == before
 

@@ -141,14 +141,14 @@ class IntegerMask(Misfit):
         return example.replace(lanes=example.lanes.replace(valid=np.asarray(example.lanes.valid, np.uint8)))
 
 
-class NoNumber(Misfit):
+class NoNumber(Changed):
     def changed(self, example: Example) -> Example:
         points = np.array(example.lanes.points)
         points[np.flatnonzero(example.lanes.valid)[0], 1, 2] = np.nan
         return example.replace(lanes=example.lanes.replace(points=points))
 
 
-class OnAMap(Misfit):
+class OnAMap(Changed):
     def changed(self, example: Example) -> Example:
         lanes = example.lanes
         return example.replace(lanes=lanes.replace(points=np.asarray(lanes.points) + np.float32(345_678.0)))
@@ -161,8 +161,8 @@ class OnAMap(Misfit):
         (AbsentAtFirst, r"traffic_flow\.\w+ is \w+ of shape .* in example 1 and absent in example 0"),
         (Converted, "bev is float32 of shape .* in example 2 and uint8 of shape"),
         (IntegerMask, r"in example 0, lanes\.valid is uint8, expected bool"),
-        (NoNumber, r"lanes of example 0 have a point that is not finite"),
-        (OnAMap, r"lanes of example 0 reach 346 km from the vehicle: their points must be in its own frame in metres"),
+        (NoNumber, r"lanes of example 2 have a point that is not finite"),
+        (OnAMap, r"lanes of example 2 reach 346 km from the vehicle: their points must be in its own frame in metres"),
         (Misfit, r"in example 0, lanes\.successor is of shape \(3, 3\), expected"),
     ],
 )

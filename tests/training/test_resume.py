@@ -222,7 +222,7 @@ def test_other_code_and_packages_are_told_at_a_resume(tmp_path, capsys):
     run(folder, start="resume")
     assert "other code" not in capsys.readouterr().err
     run(folder, start="resume", own_code="feedbeef1234")
-    assert "other code before (own classes none -> feedbeef1)" in capsys.readouterr().err
+    assert "other code before (own modules none -> feedbeef1)" in capsys.readouterr().err
 
 
 def test_a_checkpoint_is_identified_by_its_content(tmp_path):

@@ -131,7 +131,7 @@ def commits(jobs: Sequence[Job]) -> tuple[str, ...]:
 
 
 def code_notices(trained: Mapping[str, Sequence[Job]]) -> list[str]:
-    """Return notices about the code that trained runs: several commits, and own classes that were edited since."""
+    """Return notices about the code that trained runs: several commits, and own modules that were edited since."""
     notices, found = [], {name: commits(jobs) for name, jobs in trained.items()}
     if len({commit for each in found.values() for commit in each}) > 1:
         listed = "; ".join(f"{name}: {', '.join(each)}" for name, each in found.items() if each)
@@ -141,15 +141,15 @@ def code_notices(trained: Mapping[str, Sequence[Job]]) -> list[str]:
     if edited := [str(job.folder) for jobs in trained.values() for job in jobs if _was_edited(job)]:
         more = f" and {len(edited) - 1} more" if len(edited) > 1 else ""
         notices.append(
-            f"own classes were edited since they trained {edited[0]}{more}: delete these folders to train them anew"
+            f"own modules were edited since they trained {edited[0]}{more}: delete these folders to train them anew"
         )
     return notices
 
 
 def _was_edited(job: Job) -> bool:
-    """Return whether a run's own classes have other code than when it was trained, as far as that was recorded."""
+    """Return whether a run's own modules have other code than when it was trained, as far as that was recorded."""
     now = own_code(job.config)
-    return job.recorded is None and any(start.get("own_code", now) != now for start in read_provenance(job.folder))
+    return job.recorded is None and any(start.get("own_modules", now) != now for start in read_provenance(job.folder))
 
 
 def summary_of(failures: Sequence[Failure], count: int) -> str:

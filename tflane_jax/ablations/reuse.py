@@ -322,7 +322,8 @@ def _recorded(key: str, row: str, job: Job, scores: Collection[str], curves: Col
         seed=job.config.training.seeds[0],
         config=portable(job),
         threads=dict(job.threads),
-        facts=replace(own, validation=validation, gives=given_hashes(job)),
+        # Runs that start from another one are no hosts.
+        facts=replace(own, validation=validation, gives=() if own.origins else given_hashes(job)),
         measured=found,
         time=now,
     )

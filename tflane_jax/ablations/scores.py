@@ -1,7 +1,7 @@
 """Scores of trained runs on test sets, kept beside each run.
 
 An entry of a file of scores is valid for one checkpoint (its content), one data source, one evaluation setting, and one
-state of the program's code, of the user's own classes, and of the files of maps and logs. Whatever else is in the file
+state of the program's code, of the user's own modules, and of the files of maps and logs. Whatever else is in the file
 is ignored. Scores by an earlier state of the code count where `Job.scored_by` says so. Those of a recorded run are in
 its record.
 """
@@ -149,7 +149,7 @@ def _checkpoint(job: Job, config: RunConfig, which: Which) -> tuple[int, dict[st
     further = {
         "content": job.content,
         "files": source_of(source).content(source),
-        "own classes": own_content(config),
+        "own modules": own_content(config),
     }
     return step, {
         "checkpoint": checkpoints.content(step),

@@ -256,7 +256,7 @@ def _add_geometric(trained: Mapping[str, Sequence[Job]], results: Results) -> No
         for evaluation in job.further:
             measured = measure(job, replace(job.config, evaluation=evaluation), "last")
             if measured is not None:
-                found = measured.ways[""]  # of earlier programs without those of v1.0, which had been wrong
+                found = measured.ways[""]  # earlier records have none of v1.0, which were wrong
                 for score in TOPOLOGY & scores.keys() & found.keys():
                     scores[score + GEOMETRIC] = found[score]
 

@@ -16,6 +16,7 @@ import numpy as np
 from tflane_jax.datasets.base import Dataset, made
 from tflane_jax.datasets.cache import CachedDataset
 from tflane_jax.datasets.leaves import Form, check_form, example_from_leaves, example_leaves, form_of
+from tflane_jax.datasets.plausible import check_lanes
 from tflane_jax.datasets.streaming import InOrder, Streamed, StreamingConfig
 from tflane_jax.errors import UserError
 from tflane_jax.progress import progress_bar
@@ -37,8 +38,6 @@ TRAINING_PARTS = (
 _ALWAYS = ("previous_from_ego", "has_previous")
 IN_MEMORY = 6 * 2**30
 """Bytes of examples that `loading.where="auto"` keeps in memory, where their size is known before they are read."""
-FARTHEST_LANE = 10_000.0
-"""Metres from the vehicle to a point of a lane; more are coordinates of a map."""
 
 
 def load_or_stream(
@@ -68,7 +67,7 @@ def stream(dataset: Dataset, config: StreamingConfig, parts: Collection[str] = T
         return Streamed(dataset, config, select)
     first = made(dataset, 0)
     _check_first(dataset, first)
-    _check_frame(dataset, 0, first)
+    check_lanes(dataset.name, 0, first)
     return Streamed(dataset, config, select, form=form_of(example_leaves(select(first))))
 
 
@@ -91,7 +90,8 @@ def load_arrays(
         The examples stacked along a new first axis.
 
     Raises:
-        UserError: the dataset is empty, its examples differ in shape or type, or a cache file is corrupt.
+        UserError: the dataset is empty, its examples differ in shape or type, their lanes are no numbers or not in the
+            vehicle's frame (`plausible.check_lanes`), or a cache file is corrupt.
         ValueError: a name in `parts` is no field of `Example`.
     """
     _refuse_empty(dataset)
@@ -124,7 +124,7 @@ def _stacked(
             _check_first(dataset, example)
             first = form_of(found)
         check_form(dataset.name, index, found, first)
-        _check_frame(dataset, index, example)
+        check_lanes(dataset.name, index, example)
         for name, leaf in found.items():
             if parts is not None and name.split(".")[0] not in parts:
                 continue
@@ -140,19 +140,6 @@ def _check_first(dataset: Dataset, example: Example) -> None:
         example.validate()
     except AssertionError as error:
         raise UserError(f"{dataset.name}: in example 0, {error}") from None
-
-
-def _check_frame(dataset: Dataset, index: int, example: Example) -> None:
-    """Raise UserError where lanes of an example are no numbers, or too far away to be in the frame of the vehicle."""
-    for name, lanes in (("lanes", example.lanes), ("segments", example.segments)):
-        points = np.asarray(lanes.points)[np.asarray(lanes.valid)]
-        if not np.isfinite(points).all():
-            raise UserError(f"{dataset.name}: {name} of example {index} have a point that is not finite")
-        if (farthest := np.abs(points).max(initial=0.0)) > FARTHEST_LANE:
-            raise UserError(
-                f"{dataset.name}: {name} of example {index} reach {farthest / 1e3:.3g} km from the vehicle: their "
-                "points must be in its own frame in metres, x ahead and y to the left, not in coordinates of a map"
-            )
 
 
 def keep(arrays: Example, parts: Collection[str]) -> Example:

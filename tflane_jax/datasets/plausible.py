@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import pose_yaw, transform_points, wrap_angle
-from tflane_jax.scene import RoadUser
+from tflane_jax.scene import Example, RoadUser
 from tflane_jax.scene.logs import Tracks
 
 # Metres per second, and metres.
@@ -23,6 +23,8 @@ FAR = 200.0
 """Metres from a vehicle to the nearest lane. Parking lots are not on the map; another city is farther."""
 FARTHEST_STEP = 10_000.0
 """Metres from one point of a map's line to the next, or along one of its arcs; more is a damaged number."""
+FARTHEST_LANE = 10_000.0
+"""Metres from the vehicle to a point of a lane; more are coordinates of a map."""
 FARTHEST, MOST_PIXELS = 1e8, 1e6
 """Metres of a coordinate, and pixels of a camera matrix; more would be infinite in float32, or senseless."""
 LARGEST_IMAGE = 20_000
@@ -115,6 +117,19 @@ def check_distance(position: Float[np.ndarray, "n 3"], where: Sequence[str]) -> 
     if (metres > _UNSEEN).any():
         i = int(metres.argmax())
         raise UserError(f"{where[i]}: the box is {metres[i]:.0f} m from the vehicle: box or pose is wrong")
+
+
+def check_lanes(dataset: str, index: int, example: Example) -> None:
+    """Raise UserError where lanes of an example are no numbers, or too far away to be in the frame of the vehicle."""
+    for name, lanes in (("lanes", example.lanes), ("segments", example.segments)):
+        points = np.asarray(lanes.points)[np.asarray(lanes.valid)]
+        if not np.isfinite(points).all():
+            raise UserError(f"{dataset}: {name} of example {index} have a point that is not finite")
+        if (farthest := np.abs(points).max(initial=0.0)) > FARTHEST_LANE:
+            raise UserError(
+                f"{dataset}: {name} of example {index} reach {farthest / 1e3:.3g} km from the vehicle: their points "
+                "must be in its own frame in metres, x ahead and y to the left, not in coordinates of a map"
+            )
 
 
 def check_headings(

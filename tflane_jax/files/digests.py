@@ -31,7 +31,7 @@ def file_content(file: Path) -> bytes:
     return file.name.encode() + b"\0" + content + b"\0"
 
 
-@functools.lru_cache(maxsize=4096)
+@functools.cache
 def _digest(file: Path, size: int, changed_ns: int) -> bytes:
     with file.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").digest()

@@ -197,7 +197,7 @@ def train(
             states = init_states(task, optimizer, config.seeds, example)
         window, metrics, times = Window(), {}, StepTime()
         memories = [Memory() for _ in config.seeds]
-        started_from: dict[str, Any] = {"own_code": own_code}
+        started_from: dict[str, Any] = {"own_modules": own_code}
         data, due = {"examples": example_count(arrays), "content": content}, False
         agree_on_data(data)
         if start == "resume" and (saved := from_first(lambda: latest(checkpoints))) is not None:

@@ -123,8 +123,8 @@ def _changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
         pairs["commit"] = commit_of(before["git"]), commit_of(now["git"])
     old = before.get("packages") or {}
     pairs |= {name: (old[name], version) for name, version in now["packages"].items() if name in old}
-    if "own_code" in before and "own_code" in now:
-        pairs["own classes"] = before["own_code"][:9] or "none", now["own_code"][:9] or "none"
+    if "own_modules" in before and "own_modules" in now:
+        pairs["own modules"] = before["own_modules"][:9] or "none", now["own_modules"][:9] or "none"
     return [f"{name} {old} -> {new}" for name, (old, new) in pairs.items() if old != new]
 
 

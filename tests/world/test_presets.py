@@ -87,7 +87,7 @@ RECORDED = {
     "metres of lane": 604,
     "topology links": 19.7,
     "lanes beside the vehicle": 2.67,
-    "- oncoming": 2.15,
+    "oncoming lanes beside the vehicle": 2.15,
     "length, m": 27.9,
     "width, m": 4.14,
     "painted sides": 0.57,

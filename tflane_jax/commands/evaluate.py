@@ -18,9 +18,9 @@ from tflane_jax.commands.sources import (
     with_chosen_traffic,
 )
 from tflane_jax.config_io import to_json
+from tflane_jax.datasets import sources
 from tflane_jax.datasets.front_views import FrontViewConfig, FrontViewDataset
 from tflane_jax.datasets.overlap import Nearness
-from tflane_jax.datasets.sources import open_dataset
 from tflane_jax.errors import UserError
 from tflane_jax.evaluation.edge_types import weights_edge_types
 from tflane_jax.evaluation.interventions import with_traffic
@@ -113,7 +113,7 @@ def _save_edge_types(run: Run, source: Any, stem: Path) -> list[Path]:
     task = run.config.task
     if not isinstance(task, LaneShapeTask) or not weights_edge_types(task.model):
         return []
-    dataset, seeds = open_dataset(source), run.config.training.seeds
+    dataset, seeds = sources.open_dataset(source), run.config.training.seeds
     examples = stack_examples([dataset.example(index) for index in spread(len(dataset), _IMAGES)])
     models = {f"seed {seed}": Model(task, params) for seed, params in zip(seeds, run.params, strict=True)}
     return save_edge_types(models, examples, stem.with_name(f"{stem.name}-edge_types"))

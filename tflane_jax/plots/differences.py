@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _PANEL_WIDTH = 4.0  # inches
+_TITLE = 52  # characters of a line above a panel
 _HALF_WIDTH = 1.3  # metres
 Outline = Literal["edge", "filled", "dashed"]
 
@@ -103,7 +105,7 @@ def save_differences(
             draw_outlines(ax, lanes[outlined[row]])
         for ax, (model, findings) in zip(places, models.items(), strict=True):
             found = findings.found[row] & outlined[row]
-            name = f"{model}: finds {found.sum()} of {outlined[row].sum()} outlined"
+            name = textwrap.fill(f"{model}: finds {found.sum()} of {outlined[row].sum()} outlined", _TITLE)
             prediction = row_of(findings.lanes, row)
             draw_found(ax, example, prediction, ground=ground, view=view, threshold=findings.threshold, title=name)
             draw_outlines(ax, lanes[found], "filled")

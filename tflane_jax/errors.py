@@ -1,6 +1,5 @@
 """The errors that the command line shows to its user."""
 
-import importlib.metadata
 import re
 from pathlib import Path
 
@@ -30,6 +29,8 @@ def install(extra: str) -> str:
     """Return how to install an extra of this package: in its checkout, or without one by the names of the packages."""
     if _CHECKOUT.is_file():
         return f"run `pip install -e '.[{extra}]'` in the checkout of tflane_jax"
+    import importlib.metadata  # a message needs it, and every command would wait for it
+
     try:
         required = [_REQUIRED.fullmatch(text) for text in importlib.metadata.requires("tflane_jax") or ()]
     except importlib.metadata.PackageNotFoundError:  # a copy of the folder alone

@@ -15,6 +15,7 @@ import importlib
 import importlib.abc
 import importlib.machinery
 import importlib.util
+import itertools
 import os
 import shlex
 import sys
@@ -177,14 +178,14 @@ def _imports(module: str) -> tuple[str, ...]:
     while left:
         node = left.pop()
         if isinstance(node, ast.Import):
-            found |= {name.rsplit(".", n)[0] for name in (one.name for one in node.names) for n in range(9)}
+            found |= {one.name for one in node.names}
         elif isinstance(node, ast.ImportFrom):
-            base = "." * node.level + (node.module or "")
-            base = importlib.util.resolve_name(base, package) if not node.level or package else ""
+            base = importlib.util.resolve_name("." * node.level + (node.module or ""), package)
             found |= {base, *(f"{base}.{one.name}" for one in node.names)}
         elif not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda) and not _for_types(node):
             left += ast.iter_child_nodes(node)
-    return tuple(sorted(found))
+    # `import a.b` also runs a.
+    return tuple(sorted({outer for name in found for outer in itertools.accumulate(name.split("."), "{}.{}".format)}))
 
 
 def _for_types(node: ast.AST) -> bool:

@@ -147,8 +147,8 @@ def check_origin(config: RunConfig, *, replaced: Path | None = None) -> None:
     """
     if (origin := config.training.init_from) is not None:
         check_origins(origin, config.training.seeds)
-        folders = [] if replaced is None else origin_folders(origin, config.training.seeds)
-        if replaced is not None and replaced.resolve() in [folder.resolve() for folder in folders]:
+        folders = [folder.resolve() for folder in origin_folders(origin, config.training.seeds)]
+        if replaced is not None and replaced.resolve() in folders:
             raise UserError(f"training.init_from is {replaced}, which --overwrite deletes: choose another --out")
     if config.task.frozen and config.training.init_from is None:
         raise UserError(

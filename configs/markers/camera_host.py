@@ -14,12 +14,11 @@ from dataclasses import replace
 from pathlib import Path
 
 from tflane_jax.config import RunConfig, WorldData, load_config
+from tflane_jax.config_io import with_setting
 from tflane_jax.evaluation.results import EvaluationConfig
 from tflane_jax.losses.toponet import TopoNetLossConfig
 from tflane_jax.markers.simulation import MarkerConfig, MarkerSimulationConfig
-from tflane_jax.models.bev_encoder import BevFormerConfig
 from tflane_jax.models.bevformer_detr import BevFormerDetrConfig
-from tflane_jax.models.camera_encoder import CameraEncoderConfig
 from tflane_jax.models.toponet import TopoNetConfig
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.world.roads.markers import PlacementConfig
@@ -39,17 +38,8 @@ def get_config() -> RunConfig:
 
 def ablations() -> dict[str, RunConfig]:
     """Return BEVFormer-DETR, and TopoNet without memory of BEV features."""
-    return {"bevformer_detr": _on_clips("bevformer_detr"), "alone": _alone(get_config())}
-
-
-def _alone(config: RunConfig) -> RunConfig:
-    """Return a training whose frames have BEV features of their own images alone."""
-    assert isinstance(config.task, LaneGraphTask)
-    encoder = config.task.model.encoder
-    assert isinstance(encoder, CameraEncoderConfig)
-    assert isinstance(encoder.bev, BevFormerConfig)
-    model = replace(config.task.model, encoder=replace(encoder, bev=replace(encoder.bev, memory="off")))
-    return replace(config, task=replace(config.task, model=model))
+    alone = with_setting(get_config(), "task.model.encoder.bev.memory", "off")
+    return {"bevformer_detr": _on_clips("bevformer_detr"), "alone": alone}
 
 
 def _on_clips(name: str) -> RunConfig:

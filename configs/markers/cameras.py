@@ -17,9 +17,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from tflane_jax.config import RunConfig, WorldData, load_config
+from tflane_jax.config_io import with_setting
 from tflane_jax.markers.simulation import MarkerConfig, MarkerSimulationConfig
-from tflane_jax.models.bev_encoder import BevFormerConfig
-from tflane_jax.models.camera_encoder import CameraEncoderConfig
 from tflane_jax.models.marker_fusion import SMALL_MARKER_FUSION, MarkerFusionConfig, uniform_fusion
 from tflane_jax.models.priors import PriorsConfig
 from tflane_jax.models.toponet import TopoNetConfig
@@ -66,12 +65,7 @@ def ablations() -> dict[str, RunConfig]:
 
     def alone(row: RunConfig) -> RunConfig:
         """Return the row without memory of BEV features, as the host was trained."""
-        assert isinstance(row.task, LaneGraphTask)
-        encoder = row.task.model.encoder
-        assert isinstance(encoder, CameraEncoderConfig)
-        assert isinstance(encoder.bev, BevFormerConfig)
-        model = replace(row.task.model, encoder=replace(encoder, bev=replace(encoder.bev, memory="off")))
-        return replace(row, task=replace(row.task, model=model))
+        return with_setting(row, "task.model.encoder.bev.memory", "off")
 
     return {
         "toponet_single": alone(with_markers(None)),

@@ -44,6 +44,22 @@ def test_no_outlines():
     draw_outlines(new_figure()[1][0, 0], np.zeros((0, 4, 3)))
 
 
+def test_long_names_of_models_are_wrapped_above_their_panels(tmp_path, monkeypatch):
+    """Regression: the last panel's title ran out of the picture."""
+    titles = []
+    monkeypatch.setattr(
+        differences,
+        "save_figure",
+        lambda figure, path: titles.extend(ax.get_title(loc="left") or ax.get_title() for ax in figure.axes),
+    )
+    models = {"m": findings(FIRST), "a model with markers that are read from images": findings(BOTH)}
+    save_differences(tmp_path / "a.png", EXAMPLES, models, BOTH, title="t", caption="c", titles=["a", "b"])
+    long = [title for title in titles if "markers" in title and "finds" in title]
+    assert len(long) == 2
+    assert all(len(line) <= 52 for title in long for line in title.splitlines())
+    assert " ".join(long[0].split()) == "a model with markers that are read from images: finds 2 of 2 outlined"
+
+
 def findings(found, threshold=0.3):
     return Findings(stack_examples([fake_prediction(0), fake_prediction(1)]), threshold, found)
 

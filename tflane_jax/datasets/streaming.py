@@ -20,7 +20,6 @@ from tflane_jax.datasets.leaves import Form, check_form, example_leaves
 from tflane_jax.datasets.plausible import check_lanes
 from tflane_jax.errors import UserError, missing_extra
 from tflane_jax.limits import Count, CountOrZero
-from tflane_jax.scene import Example
 
 # Draws in place of an example that is not wanted.
 _MOST_DRAWS = 1000
@@ -116,8 +115,7 @@ class Streamed:
         example = example if self.select is None else self.select(example)
         if self.form is not None:
             check_form(self.dataset.name, index, example_leaves(example), self.form)
-            if isinstance(example, Example):
-                check_lanes(self.dataset.name, index, example)
+            check_lanes(self.dataset.name, index, example)
         return example
 
     def requested(self, request: Request) -> Any:

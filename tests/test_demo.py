@@ -72,7 +72,7 @@ def test_both_models_have_the_same_data_and_training():
 
 
 def test_the_experiment_that_it_names_is_the_documented_one():
-    assert demo.EXPERIMENT in (ROOT / "docs" / "tf_lane.md").read_text()
+    assert demo.EXPERIMENT in (ROOT / "docs" / "tf_lane_results.md").read_text()
 
 
 def test_the_demo_trains_compares_and_draws(tmp_path, monkeypatch, capsys):

@@ -4,17 +4,20 @@ A quoting table stands below `<!-- results: NAME -->`, which names the recorded 
 names than there, which this file translates.
 """
 
+import fnmatch
 import json
 import re
 
 import pytest
 
 from tests.shared import ROOT
+from tflane_jax.ablations.verdicts import verdicts
 
 PAGES = (
     "README.md",
     "docs/tf_lane.md",
-    "docs/markers.md",
+    "docs/tf_lane_results.md",
+    "docs/marker_results.md",
     "docs/small_models.md",
     "docs/real_roads.md",
     "docs/gtn_lane.md",
@@ -22,8 +25,8 @@ PAGES = (
 # The least count of numbers in sentences that must be those of findings; docs/real_roads.md quotes others in brackets.
 FINDINGS = {
     "README.md": 7,
-    "docs/tf_lane.md": 30,
-    "docs/markers.md": 12,
+    "docs/tf_lane_results.md": 30,
+    "docs/marker_results.md": 12,
     "docs/small_models.md": 0,
     "docs/gtn_lane.md": 12,
 }
@@ -183,7 +186,7 @@ def _changed(text, place, by):
 
 
 def test_a_row_or_a_table_without_its_source_is_found():
-    recorded, page = summaries(), (ROOT / "docs/tf_lane.md").read_text(encoding="utf-8")
+    recorded, page = summaries(), (ROOT / "docs/tf_lane_results.md").read_text(encoding="utf-8")
     for old, new, words in (
         ("<!-- results: tf_lane.2 -->", "With learned queries:", "does not name a recorded table"),
         ("<!-- results: tf_lane.2 -->", "<!-- results: tf_lane.9 -->", "does not name a recorded table"),
@@ -192,6 +195,48 @@ def test_a_row_or_a_table_without_its_source_is_found():
     ):
         assert old in page
         assert any(words in line for line in wrong_tables(page.replace(old, new), recorded)[0])
+
+
+# Cells such as "**shown +7.67**"; "not tested" and "-" quote no number.
+VERDICT = re.compile(r"(shown|not shown|contradicted) ([+-]\d+\.\d\d)")
+
+
+def wrong_verdicts(text, recorded):
+    """Return what is wrong with the tables below `<!-- verdicts: PATTERN ... -->`, and how many cells they quote.
+
+    The last columns quote findings of the tables that match the patterns, in their order; a cell that quotes none must
+    say so.
+    """
+    wrong, count = [], 0
+    for above, header, rows in tables(text):
+        if named := re.fullmatch(r"<!-- verdicts: (.+) -->", above):
+            patterns = named[1].split()
+            for row in rows:
+                for column, pattern, cell in zip(
+                    header[-len(patterns) :], patterns, row[-len(patterns) :], strict=True
+                ):
+                    names = fnmatch.filter(recorded, pattern)
+                    found = {
+                        f"{verdict['verdict']} {verdict['difference'].removesuffix(' points')}"
+                        for verdict in verdicts({name: recorded[name] for name in names})
+                        if verdict["difference"]
+                    }
+                    count += bool(VERDICT.fullmatch(cell))
+                    if cell not in found | {"not tested", "-"}:
+                        wrong.append(f"{row[0]}, {column}: {cell} is no finding of {', '.join(names)}")
+    return wrong, count
+
+
+@pytest.mark.parametrize(("page", "least"), [("docs/tf_lane_results.md", 16), ("docs/marker_results.md", 22)])
+def test_verdicts_are_the_recorded_ones(page, least):
+    text, recorded = (ROOT / page).read_text(encoding="utf-8"), summaries()
+    wrong, count = wrong_verdicts(text, recorded)
+    assert wrong == []
+    assert count >= least
+    for cell in VERDICT.finditer(text):
+        other = "shown" if cell[1] != "shown" else "not shown"
+        assert wrong_verdicts(text[: cell.start()] + other + text[cell.end(1) :], recorded)[0], cell[0]
+        assert wrong_verdicts(_changed(text, cell.end() - 1, 5), recorded)[0], cell[0]
 
 
 # Columns of the tables below `<!-- sweep: NAME -->`: model and score, in the files of docs/sweeps.
@@ -209,7 +254,7 @@ SWEEPS = {
 
 @pytest.mark.parametrize("name", SWEEPS)
 def test_tables_of_sweeps_are_the_recorded_ones(name):
-    page = (ROOT / "docs" / "markers.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "marker_results.md").read_text(encoding="utf-8")
     recorded = json.loads((ROOT / "docs" / "sweeps" / f"{name}.json").read_text(encoding="utf-8"))
     values, scores = map(float, recorded["meta"]["values"]), recorded["meta"]["scores"]
     (rows,) = (rows for above, _, rows in tables(page) if above == f"<!-- sweep: {name} -->")

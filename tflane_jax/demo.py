@@ -62,7 +62,7 @@ def main(out: Path) -> int:
     print(_INTRODUCTION)
     compare(configs(), (0,), out, jobs=2, summary=summary)
     print(f"\nWhere the two differ, with the lanes that only one of them finds: {out / 'comparison.png'}")
-    print(f"With eight seeds and controls, hours on two cores (docs/tf_lane.md has its results):\n\n{EXPERIMENT}")
+    print(f"With eight seeds and controls, hours on two cores (docs/tf_lane_results.md has them):\n\n{EXPERIMENT}")
     return 0
 
 

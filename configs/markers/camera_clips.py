@@ -5,7 +5,7 @@
 Every row starts from the host of its own seed and makes the same number of updates on clips of four frames, half a
 second apart, with or without a prior; "toponet" and "bevformer_detr" are the hosts, tuned as long. Detections are
 simulated, except in "pixels": there a detector reads the boards in native images, which are searched once and kept with
-the examples. docs/markers.md says which rows are trained.
+the examples. docs/marker_results.md says which rows are trained.
 
 The hosts pass BEV features from frame to frame, into which Eq. (3) has added the lanes of the boards. So a row without
 memory lacks the bank of markers only, and sees what BEV features keep of an earlier board. Rows `alone_...` start from

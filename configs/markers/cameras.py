@@ -10,7 +10,7 @@ forms, on single frames two seconds apart. Every row of the second starts from t
 parameters and the order of the clips. The paper's tables have hosts by the recipe of docs/small_models.md, on clips
 half a second apart and one for each seed: `camera_clips.py`. The images show the marker boards, but too small to be
 read: detections are simulated as in `toponet_markers.py` (paper, section IV-A), of boards that the rig's cameras see.
-docs/markers.md has results of earlier rows.
+docs/marker_results.md has results of earlier rows.
 """
 
 from dataclasses import replace

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import textwrap
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
@@ -12,12 +13,18 @@ from tflane_jax.ablations.archive import merged, read_archive, write_archive
 from tflane_jax.ablations.findings import HAS_INTERVAL, NO_INTERVAL
 from tflane_jax.ablations.reuse import FILE, archive_path
 from tflane_jax.ablations.tables import TABLES
+from tflane_jax.ablations.verdicts import verdicts
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import write_text
 from tflane_jax.files.fields import load_json, member
 from tflane_jax.plots.tables import counted, format_table
 
 _WIDTH = 120
+_CLAIMS = (
+    "The difference is treatment minus control in the table's primary measure; p is corrected for the claims of the "
+    "table. Intervals over scenes, negative controls and secondary measures stand with the tables below. The paper's "
+    "difference is that of its own data, in the measure that stands beside it."
+)
 
 
 def record(summaries: Sequence[Path], folder: Path) -> Path:
@@ -64,12 +71,14 @@ def page(folder: Path) -> str:
         "([a control](comparisons.md#the-papers-tables)): runs of one configuration before and after it are not the",
         "same.",
     ]
+    names = [name for name in (*TABLES, *sorted(found.keys() - TABLES.keys())) if name in found]
+    if claims := verdicts({f"[{name}](#{_anchor(found[name])})": found[name] for name in names}):
+        lines += ["", "## All claims", "", *_wrapped(_CLAIMS), "", format_table(claims)]
     remarked: dict[str, str] = {}  # the table that says it first, by remark
-    for name in (*TABLES, *sorted(found.keys() - TABLES.keys())):
-        if name in found:
-            note = found[name].get("note")  # earlier summaries have none
-            first = remarked.setdefault(note, name) if note else name
-            lines += ["", *_section(found[name], note if first == name else f"The remark on {first} holds here, too.")]
+    for name in names:
+        note = found[name].get("note")  # earlier summaries have none
+        first = remarked.setdefault(note, name) if note else name
+        lines += ["", *_section(found[name], note if first == name else f"The remark on {first} holds here, too.")]
     if missing := [name for name in TABLES if name not in found]:
         lines += [
             "",
@@ -78,6 +87,15 @@ def page(folder: Path) -> str:
             *_wrapped(", ".join(f"`{name}` ({TABLES[name].title})" for name in missing)),
         ]
     return "\n".join(lines) + "\n"
+
+
+def _heading(summary: Mapping[str, Any]) -> str:
+    return f"{summary['table']}: {summary['title']}"
+
+
+def _anchor(summary: Mapping[str, Any]) -> str:
+    """Return the name by which GitHub links to the heading of a table."""
+    return re.sub(r"[^\w\- ]", "", _heading(summary).lower()).replace(" ", "-")
 
 
 def _between(numbers: Collection[float]) -> str:
@@ -109,7 +127,7 @@ def _section(summary: Mapping[str, Any], note: str | None) -> list[str]:
     )
     facts = " ".join([facts, *summary.get("mixed hosts", ())])
     lines = [
-        f"## {summary['table']}: {summary['title']}",
+        f"## {_heading(summary)}",
         "",
         "```",
         # Numbers depend on the cores of a run, which --jobs alone takes from the machine.

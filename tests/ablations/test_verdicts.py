@@ -1,0 +1,80 @@
+"""The table of all claims, read back from the sentences of findings."""
+
+import json
+from dataclasses import replace
+
+import pytest
+
+from tests.shared import ROOT
+from tflane_jax.ablations.declaration import Claim
+from tflane_jax.ablations.effects import Effect
+from tflane_jax.ablations.findings import sentence
+from tflane_jax.ablations.verdicts import verdicts
+
+EFFECT = Effect(
+    claim=Claim("A, Eq. (2)", "B, C", "A helps (+7.7 DET_l)"),
+    row="B, C",
+    measure="all/DET_l",
+    checkpoint="last",
+    seeds=(0, 1, 2),
+    difference=0.0767,
+    low=0.05,
+    high=0.09,
+    mean=0.3,
+    std=0.01,
+    seeds_low=0.04,
+    seeds_high=0.1,
+    p=0.001,
+    p_holm=0.00312,
+    better=2,
+    finding="shown",
+)
+
+
+def only_row(text):
+    (row,) = verdicts({"t": {"findings": [text]}})
+    return row
+
+
+def test_a_sentence_is_read_back():
+    assert only_row(sentence([EFFECT])) == {
+        "table": "t",
+        "treatment": "A, Eq. (2)",
+        "control": "B, C",
+        "verdict": "shown",
+        "difference": "+7.67 points",
+        "in": "all/DET_l",
+        "p": "0.0031",
+        "better in seeds": "2 of 3",
+        "the paper": "+7.7 DET_l",
+    }
+
+
+@pytest.mark.parametrize("second", ["the negative control x/recall", "the secondary measure all/mAP"])
+def test_numbers_are_those_of_the_primary_measure(second):
+    text = sentence([EFFECT, replace(EFFECT, measure=second, p_holm=0.5, better=1, difference=-0.5)])
+    assert only_row(text) == only_row(sentence([EFFECT]))
+
+
+def test_one_seed_has_no_p():
+    one = replace(EFFECT, seeds=(0,), finding="not tested", p=float("nan"), p_holm=float("nan"))
+    row = only_row(sentence([one]))
+    assert (row["verdict"], row["difference"], row["p"], row["better in seeds"]) == (
+        "not tested",
+        "+7.67 points",
+        None,
+        None,
+    )
+
+
+def test_every_recorded_finding_is_in_the_table():
+    found = {path.stem: json.loads(path.read_text()) for path in (ROOT / "docs" / "results").glob("*.json")}
+    rows = verdicts(found)
+    assert len(rows) == sum(len(summary["findings"]) for summary in found.values())
+    findings = [text for summary in found.values() for text in summary["findings"]]
+    for row, text in zip(rows, findings, strict=True):
+        assert text.startswith(f"**{row['verdict']}**")
+        assert f"{row['treatment']} " in text
+        assert f"*{row['control']}*" in text
+        assert (row["p"] is None) == (row["verdict"] == "not tested")
+    assert all(row["difference"] or row["verdict"] == "not tested" for row in rows)

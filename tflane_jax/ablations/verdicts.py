@@ -1,0 +1,45 @@
+"""The findings of recorded tables in one table, read back from their sentences (see `findings.sentence`)."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from typing import Any
+
+# "**shown**: A is better than *B* in all/recall, +0.52 points (95 % ..., p 0.0312, better in 4 of 5 seeds). Claim: ..."
+_FINDING = re.compile(
+    r"\*\*(?P<verdict>[a-z ]+)\*\*(?: \((?P<why>.*?)\))?: (?P<treatment>.+?) (?:is better than|minus) "
+    r"\*(?P<row>.+?)\*(?: in (?P<measure>.+?), (?P<difference>[+-][\d.]+ \w+|no number))?(?P<rest>[;. ].*)?$"
+)
+_P = re.compile(r"\bp ((?:< )?[\d.]+),")
+_SEEDS = re.compile(r"better in (\d+ of \d+) seeds")
+_OF_THE_PAPER = re.compile(r" \(([+-][^()]*)\)\.?$")
+
+
+def verdicts(found: Mapping[str, Mapping[str, Any]]) -> list[dict[str, str | None]]:
+    """Return a row for each finding of the summaries, by the name of their table, in their order.
+
+    A row has treatment minus control in the primary measure, its p, in how many seeds the treatment is better, and
+    what the paper reports where the claim quotes it. Sentences of another form are left out.
+    """
+    rows: list[dict[str, str | None]] = []
+    for name, summary in found.items():
+        for finding in summary["findings"]:
+            if parts := _FINDING.match(finding):
+                rest = parts["rest"] or ""
+                primary, paper = rest.split(";")[0], _OF_THE_PAPER.search(finding)
+                p, seeds = _P.search(primary), _SEEDS.search(primary)
+                rows.append(
+                    {
+                        "table": name,
+                        "treatment": parts["treatment"],
+                        "control": parts["row"],
+                        "verdict": parts["verdict"],
+                        "difference": parts["difference"],
+                        "in": parts["measure"],
+                        "p": p and p[1],
+                        "better in seeds": seeds and seeds[1],
+                        "the paper": paper and paper[1],
+                    }
+                )
+    return rows

@@ -1,4 +1,4 @@
-"""Freed memory is kept for the next step, and given back after a training."""
+"""Settings of malloc: a training keeps freed memory for its next step, and returns it at the end."""
 
 from __future__ import annotations
 

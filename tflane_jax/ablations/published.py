@@ -67,7 +67,7 @@ def page(folder: Path) -> str:
         "A claim is *shown* or *contradicted* if the corrected p over seeds and the interval over scenes say so, else",
         "*not shown* ([how](comparisons.md)). Scores other than recall have no interval where an earlier version",
         "measured them: there p alone decides. All tables but those of markers, the long ones, gtn_lane.1 and",
-        "small_host.3 were trained before commit 33c1f339, which changed a gradient",
+        "small_host.3 were trained before commit 33c1f339, which fixed a gradient",
         "([a control](comparisons.md#the-papers-tables)): runs of one configuration before and after it are not the",
         "same.",
     ]

@@ -1,4 +1,4 @@
-"""Converted variables made those of a model: nothing missing, nothing left over but auxiliary heads.
+"""Checks converted variables against a model: none missing, none left over but auxiliary heads.
 
 Auxiliary heads exist in training only. A file may lack them, and then they start afresh, or have some that the model
 does not, which are left out.

@@ -1,4 +1,4 @@
-"""Values that are made when they are asked for, once, whichever thread asks, and kept.
+"""A thread-safe cache: each value is computed once, on first use.
 
 Only threads that ask for the same value wait while it is made.
 """

@@ -1,4 +1,4 @@
-"""Why true lanes are not found, and why detections find none: by how much of their length has a counterpart.
+"""Error types of true lanes and detections, by the fraction of their length that has a counterpart.
 
 Recall and DET_l compare whole lanes, so a lane that is seen well, but cut elsewhere than the map cuts it, counts as a
 miss and as a false detection. Here every true lane and every detection gets one of `OUTCOMES`:

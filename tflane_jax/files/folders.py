@@ -1,4 +1,4 @@
-"""Folders as a user names them."""
+"""Paths whose last part is the folder's name, also for `.` and `..`."""
 
 from __future__ import annotations
 

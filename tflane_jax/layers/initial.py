@@ -1,4 +1,4 @@
-"""Initial values that Linen has no name for."""
+"""Initialisers that Linen lacks: PyTorch's default for dense and convolution layers."""
 
 from __future__ import annotations
 

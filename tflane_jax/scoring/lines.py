@@ -1,4 +1,4 @@
-"""Remarks on lines and things themselves: none at all, no length, the same twice, sides swapped."""
+"""Warnings about lines of a submission or the truth: none, zero length, duplicates, swapped sides."""
 
 from __future__ import annotations
 

@@ -43,6 +43,7 @@ def test_a_sentence_is_read_back():
         "control": "B, C",
         "verdict": "shown",
         "difference": "+7.67 points",
+        "over scenes": "+5.00 to +9.00",
         "in": "all/DET_l",
         "p": "0.0031",
         "better in seeds": "2 of 3",

@@ -5,7 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from tflane_jax.datasets.argoverse2_log import ANNOTATIONS, POSES
+from tflane_jax.datasets.argoverse2_log import ANNOTATIONS
+from tflane_jax.datasets.argoverse2_poses import POSES
 
 FRAMES, MS = 6, 1_000_000
 POSE = {"qw": 1.0, "qx": 0.0, "qy": 0.0, "qz": 0.0, "tx_m": 0.0, "ty_m": 0.0, "tz_m": 0.0}

@@ -12,13 +12,15 @@ import pytest
 from tests.datasets.small_argoverse2 import FRAMES, MAP, MS, POSE, box, points, write, write_log
 from tflane_jax.datasets import argoverse2, log_frames
 from tflane_jax.datasets.argoverse2 import Argoverse2Config, Argoverse2Dataset
-from tflane_jax.datasets.argoverse2_log import ANNOTATIONS, POSES, check_log, find_logs, load_log
+from tflane_jax.datasets.argoverse2_log import ANNOTATIONS, check_log, find_logs, load_log
 from tflane_jax.datasets.argoverse2_map import line_type, read_map
+from tflane_jax.datasets.argoverse2_poses import POSES
 from tflane_jax.datasets.base import ExampleConfig
-from tflane_jax.errors import UserError
+from tflane_jax.errors import LeftOutWarning, UserError
 from tflane_jax.scene import LineType, RoadUser
 
 feather = pytest.importorskip("pyarrow.feather")
+pc = pytest.importorskip("pyarrow.compute")
 
 
 @pytest.fixture
@@ -97,6 +99,26 @@ def test_openlane_timestamps_take_their_own_pose_and_the_nearest_boxes(folder, t
     logs.rename(openlane / "OpenLane-V2" / logs.name)
     found = load_log(folder, openlane=openlane / "OpenLane-V2").keyframes
     assert [k.timestamp_ns for k in found] == [k.timestamp_ns for k in moments]
+
+
+def test_key_frames_of_openlane_beyond_the_annotations_are_left_out(folder, tmp_path):
+    """Regression: they took the tracks and boxes of the last annotated frame, seconds away."""
+
+    def openlane(name, *times):
+        (made := tmp_path / name).mkdir()
+        frames = {"train": {}, "val": {"10003": [f"{time * MS}.json" for time in times]}}
+        (made / "data_dict_subset_A.json").write_text(json.dumps(frames))
+        (made / "subset_A_segment_to_av2_log.json").write_text(json.dumps({"val": {"10003": "log-a"}}))
+        return made
+
+    table = feather.read_table(folder / ANNOTATIONS)
+    feather.write_feather(table.filter(pc.less(table["timestamp_ns"], 1300 * MS)), folder / ANNOTATIONS)
+    some, none = openlane("some", 1000, 1590, 1990), openlane("none", 1590, 1990)
+    with pytest.warns(LeftOutWarning, match=r"feather: 2 of 3 key frames have no annotated frame within 0.1 s"):
+        kept = load_log(folder, openlane=some).keyframes
+    assert [key.timestamp_ns for key in kept] == [1000 * MS]
+    with pytest.raises(UserError, match="2 of 2 key frames have no annotated frame"):
+        load_log(folder, openlane=none)
 
 
 def test_a_key_frame_without_a_box_takes_the_time_of_a_pose(folder):

@@ -11,12 +11,14 @@ from tests.shared import shared_path
 from tflane_jax.cli import main
 from tflane_jax.datasets.argoverse2 import SOURCE, Argoverse2Config, Argoverse2Dataset, LogData, check_argoverse2
 from tflane_jax.datasets.argoverse2_cameras import RING, LogImages, has_images
-from tflane_jax.datasets.argoverse2_log import POSES, load_log
+from tflane_jax.datasets.argoverse2_log import load_log
+from tflane_jax.datasets.argoverse2_poses import POSES
 from tflane_jax.datasets.base import ExampleConfig
 from tflane_jax.datasets.data_source import Choice
 from tflane_jax.datasets.nuscenes import NuScenesConfig
 from tflane_jax.datasets.openlane_v2 import OpenLaneV2Config
 from tflane_jax.datasets.procedural import ProceduralConfig
+from tflane_jax.datasets.streaming import StreamingConfig
 from tflane_jax.datasets.view_images import TOPONET_SUBSET_A, ImageConfig
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import invert_pose, transform_points
@@ -210,6 +212,16 @@ def test_a_model_of_the_same_cameras_reads_recorded_images(written, tmp_path):
     assert SOURCE.streams(data.source("train"))
     with pytest.raises(UserError, match="set one of them to None"):
         Argoverse2Dataset(Argoverse2Config(written, example=drawn, image=HALVED))
+
+
+def test_another_folder_of_logs_leaves_the_other_settings_of_the_run(written, tmp_path):
+    """Regression: which frames are examples, OpenLane-V2's folder and the loading became the defaults."""
+    run = Argoverse2Config(
+        tmp_path, example=NONE, keyframes="annotations", openlane=tmp_path, loading=StreamingConfig(threads=7)
+    )
+    assert SOURCE.choose(Choice("test", False, run, written)) == replace(run, root=written)
+    other = SOURCE.choose(Choice("test", False, run, written, openlane=written))
+    assert other == replace(run, root=written, openlane=written)
 
 
 @pytest.mark.golden

@@ -11,7 +11,8 @@ import pytest
 
 from tests.datasets.small_argoverse2 import LANE, MAP, points, write, write_log
 from tflane_jax.datasets.argoverse2 import Argoverse2Config, Argoverse2Dataset
-from tflane_jax.datasets.argoverse2_log import ANNOTATIONS, POSES, check_log, load_log
+from tflane_jax.datasets.argoverse2_log import ANNOTATIONS, check_log, load_log
+from tflane_jax.datasets.argoverse2_poses import POSES
 from tflane_jax.errors import UserError
 
 feather = pytest.importorskip("pyarrow.feather")

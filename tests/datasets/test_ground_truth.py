@@ -14,8 +14,8 @@ from tflane_jax.datasets.map_geometry import BOUNDARY_MARGIN, clip_ring
 from tflane_jax.datasets.prepared_map import prepare_map
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import PerceptionRange, invert_pose, yaw_pose
-from tflane_jax.scene import AreaType
-from tflane_jax.scene.logs import MapElement
+from tflane_jax.scene import AreaType, LineType
+from tflane_jax.scene.logs import LaneSegment, MapElement
 
 RANGE = PerceptionRange()
 NO_BOXES, NO_BUILDINGS = np.zeros((0, 7)), np.zeros((0, 5))
@@ -71,6 +71,29 @@ def test_a_boundary_that_is_inside_elsewhere_keeps_the_stretch_beside_the_center
     np.testing.assert_allclose(graph.points[0, 0, :2], [0.0, 24.5], atol=1e-5)
     assert graph.right[0, :, 0].max() < 3.0
     assert graph.right[0, :, 1].min() > 25.0
+
+
+@pytest.mark.parametrize("shift", [0.0, 0.3, -0.3])
+def test_a_lane_that_turns_back_has_the_side_that_runs_its_way(shift):
+    """Regression: the boundary between the legs was taken for that of the first one; the second one's was cut short.
+
+    The boundary lies between the legs, or a little nearer to one of them.
+    """
+    x, angle = np.arange(61.0), np.linspace(-np.pi / 2, np.pi / 2, 15)[1:-1]
+
+    def there_and_back(y):
+        """Return the line at `y` to the right of the legs' middle, round a half circle and back to its left."""
+        turn_x, turn_y = 60.0 + y * np.cos(angle), y * np.sin(angle)
+        across = np.concatenate([np.full(61, -y), turn_y, np.full(61, y)])
+        return np.stack([np.concatenate([x, turn_x, x[::-1]]), across, np.zeros(len(across))], -1)
+
+    left = there_and_back(0.0) + np.array([0.0, shift, 0.0])
+    lane = LaneSegment(0, there_and_back(1.75), left, there_and_back(3.5), LineType.SOLID, LineType.DASHED, False, ())
+    graph = crop(lane_map(lane), flavour="segments").graph
+    assert graph.valid.sum() == 2
+    for row, way in enumerate(([0.0, 50.0], [50.0, 0.0])):
+        for name in ("points", "left", "right"):
+            np.testing.assert_allclose(getattr(graph, name)[row, [0, -1], 0], way, atol=1e-4)
 
 
 def test_a_lane_cut_in_two_joins_its_neighbours_only_at_its_own_ends():

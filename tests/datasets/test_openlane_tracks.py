@@ -16,7 +16,8 @@ from tests.shared import shared_path
 from tflane_jax.cli import main
 from tflane_jax.config import OpenLaneV2Data, RunConfig
 from tflane_jax.datasets.argoverse2_export import export_tracks
-from tflane_jax.datasets.argoverse2_log import ANNOTATIONS, POSES, load_log
+from tflane_jax.datasets.argoverse2_log import ANNOTATIONS, load_log
+from tflane_jax.datasets.argoverse2_poses import POSES
 from tflane_jax.datasets.base import ExampleConfig, MissingTracksWarning
 from tflane_jax.datasets.nuscenes_export import _sample_frames, export_scenes
 from tflane_jax.datasets.openlane_check import check_openlane_v2

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 import textwrap
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from tflane_jax.ablations.verdicts import verdicts
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import write_text
 from tflane_jax.files.fields import load_json, member
+from tflane_jax.plots.claims import save_claims
 from tflane_jax.plots.tables import counted, format_table
 
 _WIDTH = 120
@@ -29,6 +30,8 @@ _CLAIMS = (
 
 def record(summaries: Sequence[Path], folder: Path) -> Path:
     """Copy summaries (see `table_run`), if any, into the folder of results, write its page anew, and return the page.
+
+    The pictures of `draw_claims` lie in the folder.
 
     The page lies beside the folder: `docs/results` has `docs/results.md`. The runs of each table are added to those in
     `docs/results/scores`. A summary that lacks seeds of the one that is there does not replace it, because its tests
@@ -53,12 +56,21 @@ def record(summaries: Sequence[Path], folder: Path) -> Path:
             )
             continue
         write_text(there, json.dumps(content, indent=1) + "\n")
+    draw_claims(folder)
     return write_text(folder.with_name(f"{folder.name}.md"), page(folder))
+
+
+def draw_claims(folder: Path) -> None:
+    """Draw the claims of a folder of summaries: a picture for each group of tables, such as `markers.png`."""
+    found = _summaries(folder)
+    for group, names in _groups(found).items():
+        if claims := verdicts({name: found[name] for name in names}):
+            save_claims(folder / f"{group}.png", claims, {name: _heading(found[name]) for name in names})
 
 
 def page(folder: Path) -> str:
     """Return the page of a folder of summaries, in the order of the tables."""
-    found = {path.stem: load_json(path) for path in folder.glob("*.json")}
+    found = _summaries(folder)
     lines = [
         "# Results",
         "",
@@ -71,9 +83,11 @@ def page(folder: Path) -> str:
         "([a control](comparisons.md#the-papers-tables)): runs of one configuration before and after it are not the",
         "same.",
     ]
-    names = [name for name in (*TABLES, *sorted(found.keys() - TABLES.keys())) if name in found]
+    names = list(found)
     if claims := verdicts({f"[{name}](#{_anchor(found[name])})": found[name] for name in names}):
         lines += ["", "## All claims", "", *_wrapped(_CLAIMS), "", format_table(claims)]
+        for group in _groups(name for name in names if found[name]["findings"]):
+            lines += ["", f"![Claims of {group}]({folder.name}/{group}.png)"]
     remarked: dict[str, str] = {}  # the table that says it first, by remark
     for name in names:
         note = found[name].get("note")  # earlier summaries have none
@@ -87,6 +101,20 @@ def page(folder: Path) -> str:
             *_wrapped(", ".join(f"`{name}` ({TABLES[name].title})" for name in missing)),
         ]
     return "\n".join(lines) + "\n"
+
+
+def _summaries(folder: Path) -> dict[str, Mapping[str, Any]]:
+    """Return the summaries of a folder by name, in the order of the tables."""
+    found = {path.stem: load_json(path) for path in folder.glob("*.json")}
+    return {name: found[name] for name in (*TABLES, *sorted(found.keys() - TABLES.keys())) if name in found}
+
+
+def _groups(names: Iterable[str]) -> dict[str, list[str]]:
+    """Return the names of tables by what stands before the first dot."""
+    groups: dict[str, list[str]] = {}
+    for name in names:
+        groups.setdefault(name.partition(".")[0], []).append(name)
+    return groups
 
 
 def _heading(summary: Mapping[str, Any]) -> str:

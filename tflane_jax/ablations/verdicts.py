@@ -11,6 +11,7 @@ _FINDING = re.compile(
     r"\*\*(?P<verdict>[a-z ]+)\*\*(?: \((?P<why>.*?)\))?: (?P<treatment>.+?) (?:is better than|minus) "
     r"\*(?P<row>.+?)\*(?: in (?P<measure>.+?), (?P<difference>[+-][\d.]+ \w+|no number))?(?P<rest>[;. ].*)?$"
 )
+_INTERVAL = re.compile(r"95 % ([+-][\d.]+ to [+-][\d.]+)")
 _P = re.compile(r"\bp ((?:< )?[\d.]+),")
 _SEEDS = re.compile(r"better in (\d+ of \d+) seeds")
 _OF_THE_PAPER = re.compile(r" \(([+-][^()]*)\)\.?$")
@@ -19,8 +20,8 @@ _OF_THE_PAPER = re.compile(r" \(([+-][^()]*)\)\.?$")
 def verdicts(found: Mapping[str, Mapping[str, Any]]) -> list[dict[str, str | None]]:
     """Return a row for each finding of the summaries, by the name of their table, in their order.
 
-    A row has treatment minus control in the primary measure, its p, in how many seeds the treatment is better, and
-    what the paper reports where the claim quotes it. Sentences of another form are left out.
+    A row has treatment minus control in the primary measure, its 95 % interval over scenes, p, in how many seeds the
+    treatment is better, and what the paper reports where the claim quotes it. Sentences of another form are left out.
     """
     rows: list[dict[str, str | None]] = []
     for name, summary in found.items():
@@ -28,7 +29,7 @@ def verdicts(found: Mapping[str, Mapping[str, Any]]) -> list[dict[str, str | Non
             if parts := _FINDING.match(finding):
                 rest = parts["rest"] or ""
                 primary, paper = rest.split(";")[0], _OF_THE_PAPER.search(finding)
-                p, seeds = _P.search(primary), _SEEDS.search(primary)
+                interval, p, seeds = (pattern.search(primary) for pattern in (_INTERVAL, _P, _SEEDS))
                 rows.append(
                     {
                         "table": name,
@@ -36,6 +37,7 @@ def verdicts(found: Mapping[str, Mapping[str, Any]]) -> list[dict[str, str | Non
                         "control": parts["row"],
                         "verdict": parts["verdict"],
                         "difference": parts["difference"],
+                        "over scenes": interval and interval[1],
                         "in": parts["measure"],
                         "p": p and p[1],
                         "better in seeds": seeds and seeds[1],

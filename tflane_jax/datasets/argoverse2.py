@@ -189,6 +189,9 @@ def _choose(choice: Choice) -> Argoverse2Config:
     image = _recorded(choice.configured, root)
     if image is not None:  # recorded images take the place of drawn ones
         example = replace(example, cameras=None)
+    if isinstance(configured := choice.configured, Argoverse2Config):  # a run on such logs keeps its other settings
+        openlane = choice.openlane or configured.openlane
+        return replace(configured, root=root, openlane=openlane, example=example, image=image)
     return Argoverse2Config(root, openlane=choice.openlane, example=example, image=image)
 
 

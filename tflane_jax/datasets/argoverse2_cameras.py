@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
-from tflane_jax.datasets.argoverse2_log import POSE_COLUMNS, POSES, poses_of, read_poses
+from tflane_jax.datasets.argoverse2_poses import POSE_COLUMNS, POSES, poses_of, read_poses
 from tflane_jax.datasets.openlane_frames import SUBSETS, FrameCamera
 from tflane_jax.datasets.plausible import LARGEST_IMAGE, MOST_PIXELS, first_twice
 from tflane_jax.datasets.view_images import ImageConfig, ImageFit, fit_image

@@ -12,7 +12,8 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from tflane_jax.datasets.argoverse2_log import ANNOTATIONS, POSES
+from tflane_jax.datasets.argoverse2_log import ANNOTATIONS
+from tflane_jax.datasets.argoverse2_poses import POSES
 from tflane_jax.datasets.base import Split
 from tflane_jax.errors import UserError, missing_extra
 from tflane_jax.files.atomic import replacing

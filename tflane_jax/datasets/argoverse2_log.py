@@ -8,39 +8,33 @@ https://argoverse.github.io/user-guide (sensor dataset; annotations.feather, cit
 from __future__ import annotations
 
 import itertools
+import warnings
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Float
 
 from tflane_jax.datasets.argoverse2_map import read_map
+from tflane_jax.datasets.argoverse2_poses import POSE_COLUMNS, poses_at, poses_of, read_poses
 from tflane_jax.datasets.log_frames import LogOutline
 from tflane_jax.datasets.openlane_splits import openlane_timestamps
 from tflane_jax.datasets.plausible import (
-    FARTHEST,
     check_distance,
     check_headings,
     check_interval,
-    check_motion,
     check_place,
     missing_frames,
 )
-from tflane_jax.errors import UserError
+from tflane_jax.errors import LeftOutWarning, UserError
 from tflane_jax.files.feather_table import Kind, read_columns
 from tflane_jax.files.folders import named_folder
-from tflane_jax.geometry import matrix_from_quaternion, pose_matrix
 from tflane_jax.scene import RoadUser
 from tflane_jax.scene.logs import KeyFrame, Log, Tracks, VectorMap
 
-ANNOTATIONS, POSES = "annotations.feather", "city_SE3_egovehicle.feather"
-_QUATERNION, _SIZE = ("qw", "qx", "qy", "qz"), ("length_m", "width_m", "height_m")
-POSE_COLUMNS: Mapping[str, Kind] = {
-    "timestamp_ns": "integer",
-    **dict.fromkeys((*_QUATERNION, "tx_m", "ty_m", "tz_m"), "number"),
-}
+ANNOTATIONS = "annotations.feather"
+_SIZE = ("length_m", "width_m", "height_m")
 _BOX_COLUMNS: Mapping[str, Kind] = {
     **POSE_COLUMNS,
     "track_uuid": "text",
@@ -48,10 +42,10 @@ _BOX_COLUMNS: Mapping[str, Kind] = {
     **dict.fromkeys(_SIZE, "number"),
     "num_interior_pts": "integer",
 }
-# Deviation of a quaternion's norm from 1.
-_UNIT = 1e-2
 # Every fifth lidar frame is 2 Hz, the rate of OpenLane-V2.
 _FRAMES_PER_KEYFRAME = 5
+# Seconds between a key frame of OpenLane-V2 and the nearest lidar frame; cameras are some 10 ms off.
+_NEAR = 0.1
 # Seconds without a box after which annotations are not those of one drive.
 _QUIET = 600.0
 
@@ -109,7 +103,8 @@ def load_log(
         folder: holds annotations.feather, city_SE3_egovehicle.feather and map/.
         keyframes: "openlane_v2" takes the 2 Hz frames of OpenLane-V2, "annotations" every annotated frame (10 Hz).
         openlane: folder of the OpenLane-V2 split files, which hold the exact timestamps (of the front camera). Without
-            it, or for a log that is not in them, "openlane_v2" takes every fifth frame.
+            it, or for a log that is not in them, "openlane_v2" takes every fifth frame. Those without annotations
+            near them are left out, with a warning.
         categories: road user of each category, None to leave it out.
         with_map: False leaves the map empty, for tracks alone.
 
@@ -156,13 +151,13 @@ def _drive(
             f"{folder / ANNOTATIONS} holds no annotated frame (the test split has none): use a train or val log"
         )
     check_interval(annotated, "nanoseconds", str(folder / ANNOTATIONS))
-    _poses_at(annotated, pose_times, poses, folder)  # of these the file has the exact ones
+    poses_at(annotated, pose_times, poses, folder)  # of these the file has the exact ones
     # Frames without a box have no time of their own: each takes that of a pose, as annotated ones have it.
     times = np.unique(pose_times[_nearest(pose_times, _with_empty_frames(annotated, folder))])
     moments = annotated if keyframes == "annotations" else times[::_FRAMES_PER_KEYFRAME]
     if keyframes == "openlane_v2" and openlane is not None:
-        moments = openlane_timestamps(openlane).get(folder.name, moments)
-    at_moments = zip(moments, _poses_at(moments, pose_times, poses, folder), _nearest(times, moments), strict=True)
+        moments = _annotated(openlane_timestamps(openlane).get(folder.name, moments), times, folder)
+    at_moments = zip(moments, poses_at(moments, pose_times, poses, folder), _nearest(times, moments), strict=True)
     return (
         times,
         poses[_nearest(pose_times, times)],
@@ -170,42 +165,24 @@ def _drive(
     )
 
 
+def _annotated(moments: np.ndarray, times: np.ndarray, folder: Path) -> np.ndarray:
+    """Return the moments that have an annotated frame near them; warn of others, which a file cut short may lack."""
+    near = np.abs(times[_nearest(times, moments)] - moments) <= _NEAR * 1e9
+    if not near.all():
+        message = (
+            f"{folder / ANNOTATIONS}: {(~near).sum()} of {len(near)} key frames have no annotated frame within "
+            f"{_NEAR:g} s and are left out; if the log has road users there, download the file again"
+        )
+        if not near.any():
+            raise UserError(message)
+        warnings.warn(message, LeftOutWarning, stacklevel=2)
+    return moments[near]
+
+
 def city_of(folder: Path) -> str:
     """Return the city of a log, which the name of its map file tells; "" without it."""
     names = sorted((folder / "map").glob("log_map_archive_*____*_city_*.json"))
     return names[0].stem.split("____")[1].split("_")[0] if names else ""
-
-
-def read_poses(folder: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Return timestamps (P,), ascending, and global_from_ego (P, 4, 4).
-
-    Raises UserError for a damaged file, two poses of one time, or a vehicle that jumps.
-    """
-    path = folder / POSES
-    table = read_columns(path, POSE_COLUMNS)
-    order = np.argsort(table["timestamp_ns"], kind="stable")
-    times, poses = table["timestamp_ns"][order], poses_of(path, table)[order]
-    if (same := np.diff(times) == 0).any():
-        raise UserError(f"{path} has two poses at {times[same.argmax()]}: download it again")
-    check_motion(poses[:, :2, 3], times, [f"{path}: time {time}" for time in times.tolist()])
-    return times, poses
-
-
-def poses_of(path: Path, table: Mapping[str, np.ndarray]) -> Float[np.ndarray, "n 4 4"]:
-    """Return the poses in the columns of a file; raise UserError for what is no unit quaternion, or not in metres."""
-    quaternion = np.stack([table[c] for c in _QUATERNION], -1)
-    if (odd := np.abs(np.linalg.norm(quaternion, axis=-1) - 1.0) > _UNIT).any():
-        row = int(odd.argmax())
-        raise UserError(
-            f"{path}: qw, qx, qy, qz of row {row} are {quaternion[row].tolist()}, no unit quaternion: download it again"
-        )
-    place = np.stack([table[c] for c in ("tx_m", "ty_m", "tz_m")], -1)
-    if (far := np.abs(place).max(-1, initial=0.0) > FARTHEST).any():
-        row = int(far.argmax())
-        raise UserError(
-            f"{path}: tx_m, ty_m, tz_m of row {row} are {place[row].tolist()}, no metres: download it again"
-        )
-    return pose_matrix(matrix_from_quaternion(quaternion), place)
 
 
 def _read_boxes(path: Path) -> dict[str, np.ndarray]:
@@ -224,20 +201,6 @@ def _read_boxes(path: Path) -> dict[str, np.ndarray]:
     place = np.stack([boxes[name] for name in ("tx_m", "ty_m", "tz_m")], -1)
     check_distance(place, [f"{path}: row {row}" for row in range(len(place))])
     return boxes
-
-
-def _poses_at(times: np.ndarray, pose_times: np.ndarray, poses: np.ndarray, folder: Path) -> np.ndarray:
-    """Return the poses whose timestamps are exactly `times`."""
-    if not len(pose_times):
-        raise UserError(f"{folder / POSES} holds no pose: download it again")
-    row = np.minimum(np.searchsorted(pose_times, times), len(pose_times) - 1)
-    missing = times[pose_times[row] != times]
-    if len(missing):
-        raise UserError(
-            f"{folder / POSES} has no pose at {len(missing)} of {len(times)} frames (first {missing[0]}): "
-            "annotations and poses are not of the same log; download both again"
-        )
-    return poses[row]
 
 
 def _nearest(times: np.ndarray, wanted: np.ndarray) -> np.ndarray:

@@ -20,9 +20,9 @@ from tflane_jax.geometry.polylines import (
     arc_length,
     clip_to_range,
     nearest_lines,
-    nearest_on,
     resample_lines,
     sample_at,
+    segment_distances,
 )
 from tflane_jax.scene import LaneGraph, TrafficElements
 from tflane_jax.scene.logs import MapElement
@@ -141,28 +141,44 @@ def _boundary_of(part: np.ndarray, line: np.ndarray, whole: np.ndarray, range_: 
     if len(inside) == 1 and np.array_equal(part, whole):
         return inside[0]
     start, stop = (_position_along(whole, end) for end in (part[0], part[-1]))
-    inside = [piece for piece in inside if _lies_beside(piece, whole, start, stop)]
-    if inside:
+    beside = [(way, piece) for piece in inside if (way := _lies_beside(piece, whole, start, stop)) is not None]
+    if beside:
         middle = sample_at(part, np.array([arc_length(part)[-1] / 2]))[0, :2]
-        return min(inside, key=lambda piece: np.linalg.norm(piece[:, :2] - middle, axis=-1).min())
+        return min(beside, key=lambda of: (of[0] == "against", np.linalg.norm(of[1][:, :2] - middle, axis=-1).min()))[1]
     span = np.array([start, stop]) / arc_length(whole)[-1]
     return sample_at(line, np.linspace(span[0], span[1], 11) * arc_length(line)[-1])
 
 
-def _lies_beside(piece: np.ndarray, whole: np.ndarray, start: float, stop: float) -> bool:
-    """Return whether a boundary's piece is beside a stretch of the centerline, or nearly so.
+def _lies_beside(piece: np.ndarray, whole: np.ndarray, start: float, stop: float) -> Literal["along", "against"] | None:
+    """Return which way a boundary's piece runs beside a stretch of the centerline, or nearly so; None if it does not.
 
-    A lane that leaves the range and comes back may have a centerline inside where the boundary is outside.
+    A lane that leaves the range and comes back may have a centerline inside where the boundary is outside. Where it
+    turns back, the boundary between its legs lies beside both; each leg has the piece that runs its way.
     """
-    first, last = sorted(_position_along(whole, end) for end in (piece[0], piece[-1]))
-    return first - stop <= _BESIDE and start - last <= _BESIDE
+    first, last = (_position_along(whole, end, (start, stop)) for end in (piece[0], piece[-1]))
+    if min(first, last) - stop > _BESIDE or start - max(first, last) > _BESIDE:
+        return None
+    if last >= first:
+        return "along"
+    nearest = [_position_along(whole, end) for end in (piece[0], piece[-1])]
+    return "against" if nearest == [first, last] else None
 
 
-def _position_along(line: np.ndarray, point: np.ndarray) -> float:
-    """Return the arc length at which a line passes nearest to a point."""
-    segment, fraction, _ = nearest_on(line, point[:2])
-    step = line[segment + 1, :2] - line[segment, :2]
-    return float(arc_length(line)[segment] + fraction * np.sqrt((step**2).sum()))
+def _position_along(line: np.ndarray, point: np.ndarray, stretch: tuple[float, float] | None = None) -> float:
+    """Return the arc length at which a line passes nearest to a point.
+
+    With `stretch`, a range of arc lengths, of places about as near the one that is nearest to it.
+    """
+    step = np.diff(line[:, :2], axis=0)
+    fraction, distance = segment_distances(point[:2], line[:-1, :2], step)
+    position = arc_length(line)[:-1] + fraction * np.linalg.norm(step, axis=-1)
+    if stretch is None:
+        return float(position[distance.argmin()])
+    around = np.pad(distance, 1, constant_values=np.inf)
+    least = (distance <= around[:-2]) & (distance <= around[2:])
+    passes = least & (distance <= 1.5 * distance.min() + 0.5)
+    gap = np.maximum(np.maximum(stretch[0] - position, position - stretch[1]), 0.0)
+    return float(position[np.lexsort((distance, np.where(passes, gap, np.inf)))[0]])
 
 
 def traffic_elements(

@@ -14,7 +14,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float
 
-from tflane_jax.datasets.argoverse2_log import city_of, find_logs, read_poses
+from tflane_jax.datasets.argoverse2_log import city_of, find_logs
+from tflane_jax.datasets.argoverse2_poses import read_poses
 from tflane_jax.datasets.base import IndexedExamples
 from tflane_jax.errors import UserError
 from tflane_jax.files.fields import load_members, member, numbers

@@ -13,8 +13,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from tflane_jax.datasets.argoverse2_log import ANNOTATIONS, POSES, load_log, log_outline
+from tflane_jax.datasets.argoverse2_log import ANNOTATIONS, load_log, log_outline
 from tflane_jax.datasets.argoverse2_map import MAP_PATTERN
+from tflane_jax.datasets.argoverse2_poses import POSES
 from tflane_jax.datasets.geojson_lanes import read_lanes
 from tflane_jax.datasets.log_frames import LogOutline
 from tflane_jax.datasets.nuscenes_place import SCENE_TABLE, read_scene, scene_files, scene_outline

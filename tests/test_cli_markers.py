@@ -8,6 +8,7 @@ import pytest
 from tests.markers.test_detection import AHEAD, photo, pose
 from tflane_jax.cli import main
 from tflane_jax.commands.markers import _label_place
+from tflane_jax.errors import LeftOutWarning
 
 cv2 = pytest.importorskip("cv2")
 
@@ -51,6 +52,30 @@ def test_no_photo_is_replaced_by_a_picture(photos, capsys):
     assert "000-a-markers.png is one of the files to read, and what is made from" in capsys.readouterr().err
     assert other.read_bytes() == before
     assert sorted(path.name for path in photos.iterdir()) == ["000-a-markers.png", "a.png"]
+
+
+def test_pictures_of_an_earlier_run_are_no_photos(photos, capsys):
+    """Regression: the second run in one folder searched those of the first, the third those of both."""
+    (photos / "b.png").unlink()
+    command = ["markers", "detect", str(photos), *INTRINSICS, "--out", str(photos)]
+    assert main(command) == 0
+    for _ in range(2):
+        with pytest.warns(LeftOutWarning, match="1 picture of an earlier run in .*: 000-a-markers.png"):
+            assert main(command) == 0
+        assert len(json.loads((photos / "detections.json").read_text())["photos"]) == 1
+    assert sorted(path.name for path in photos.iterdir()) == ["000-a-markers.png", "a.png", "detections.json"]
+    (photos / "a.png").unlink()
+    with pytest.warns(LeftOutWarning, match="1 picture of an earlier run"):
+        assert main(command) == 2
+    assert "holds no photos but pictures of an earlier run" in capsys.readouterr().err
+
+
+def test_a_photo_too_long_for_opencv_is_a_fault(photos, tmp_path, capsys):
+    """Regression: cv2.undistort raised, and the answers of all photos were lost."""
+    cv2.imwrite(str(photos / "c.png"), np.zeros((40, 33_000, 3), np.uint8))
+    intrinsics = ["--intrinsics", "900", "900", "480", "20", "--distortion", "1e-4", "0", "0", "0"]
+    assert main(["markers", "detect", str(photos / "c.png"), *intrinsics, "--out", str(tmp_path / "out")]) == 2
+    assert "c.png has 33000 x 40 pixels; lens distortion" in capsys.readouterr().err
 
 
 def test_a_photo_whose_name_is_not_utf8_is_a_fault(photos, tmp_path, capsys):

@@ -168,6 +168,61 @@ def test_a_run_that_is_stopped_keeps_its_answers(predict, tmp_path):
     assert not found["complete"]
 
 
+def test_a_video_that_is_stopped_keeps_its_frames(predict, tmp_path, monkeypatch):
+    """Regression: all of it was lost, and with a kill nothing was written for as long as it took."""
+    video = cv2.VideoWriter(str(tmp_path / "drive.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 5, (64, 48))
+    for i in range(9):
+        video.write(np.full((48, 64, 3), 20 * i, np.uint8))
+    video.release()
+    seen = []
+
+    def read(self, photo, camera):
+        if len(seen) == 5:
+            seen.append(report(tmp_path))
+            raise KeyboardInterrupt
+        seen.append(photo)
+        return PhotoLanes(
+            fit_photo(photo, camera).placement, (np.array([[1.0, 10.0], [2.0, 20.0]]),), (0.9,), (0.5,), 0.3, ""
+        )
+
+    monkeypatch.setattr(Reader, "read", read)
+    monkeypatch.setattr(predict_photos, "_SAVED_EVERY", 0.0)
+    monkeypatch.setattr(predict_photos, "_SAVING", np.inf)
+    with pytest.raises(KeyboardInterrupt):
+        predict("drive.avi", horizon=24.0)
+    for found in (seen[-1], report(tmp_path)):  # while it ran, and after
+        (record,) = found["videos"]
+        assert (len(record["frames"]), record["video"], record["warning"]) == (5, None, "not all frames were read")
+        assert not found["complete"]
+
+
+def test_a_video_that_becomes_unreadable_is_a_fault(predict, tmp_path, monkeypatch):
+    """What was read of it is no answer."""
+    frames = [np.zeros((48, 64, 3), np.uint8)] * 3
+
+    def broken(path):
+        yield from frames
+        raise UserError(f"{path}: the frames change their size")
+
+    video = cv2.VideoWriter(str(tmp_path / "drive.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 5, (64, 48))
+    for frame in frames:
+        video.write(frame)
+    video.release()
+    monkeypatch.setattr(predict_photos, "read_frames", broken)
+    assert predict("drive.avi", horizon=24.0) == 2
+    found = report(tmp_path)
+    assert (found["videos"], len(found["faults"]), found["complete"]) == ([], 1, True)
+
+
+def test_a_photo_with_the_longest_name_that_a_file_can_have_gets_a_picture(predict, tmp_path):
+    for end in "ab":
+        photo(tmp_path / "photo.png")
+        (tmp_path / "photo.png").rename(tmp_path / f"{'道' * 83}{end}.png")  # 254 bytes
+    assert predict(".") == 0
+    pictures = [record["picture"] for record in report(tmp_path)["photos"]]
+    assert pictures == [f"{'道' * 66}-lanes.png", f"{'道' * 66}-2-lanes.png"]
+
+
 def test_a_video_that_was_cut_off_is_told(predict, tmp_path):
     path = tmp_path / "drive.avi"
     video = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 5, (64, 48))

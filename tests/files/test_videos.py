@@ -34,6 +34,28 @@ def test_sampled_frames_are_spread(video):
     np.testing.assert_allclose(reds, [0, 80, 160], atol=12)
 
 
+def test_frames_of_a_video_without_a_count_are_spread_as_well(tmp_path):
+    """Regression: all but the first were the next ones, as every place in it was 0. A bare stream has no header."""
+    jpegs = [cv2.imencode(".jpg", np.full((48, 64, 3), 12 * i, np.uint8))[1].tobytes() for i in range(20)]
+    (tmp_path / "stream.avi").write_bytes(b"".join(jpegs))
+    assert video_info(tmp_path / "stream.avi").frames == 0
+    for count, places in ((3, [0, 4, 12]), (30, range(20)), (1, [0])):
+        levels = [frame.mean() for frame in sample_frames(tmp_path / "stream.avi", count)]
+        np.testing.assert_allclose(levels, [12 * i for i in places], atol=2)
+
+
+@pytest.mark.parametrize(
+    ("rate", "written"),
+    [(119.923, 119.92), (66.667, 66.67), (999.987, 1000.0), (240.001, 240.0), (119.88, 119.88), (29.97, 29.97)],
+)
+def test_videos_of_uneven_rates_are_written(tmp_path, rate, written, capfd):
+    """Regression: MPEG-4 counts at most 65,535 ticks a second, and OpenCV refused thousandths of more frames."""
+    with writing_video(tmp_path / "fast.mp4", VideoInfo(3, rate, 64, 48)) as writer:
+        writer.add(np.zeros((48, 64, 3), np.uint8))
+    assert video_info(tmp_path / "fast.mp4").rate == pytest.approx(written, abs=1e-3) or written == 1000.0
+    assert capfd.readouterr().err == ""
+
+
 def test_an_interrupted_video_is_not_left(tmp_path):
     def interrupted():
         with writing_video(tmp_path / "drive.mp4", INFO) as writer:

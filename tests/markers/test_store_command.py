@@ -45,7 +45,8 @@ def test_the_store_of_a_scene(tmp_path, capsys):
     [
         (["--log", "nowhere"], "neither a scene number nor a folder"),
         (["--log", "200000040"], "has no junction, split or merge"),
-        (["--log", "1", "--radius", "0"], "--radius must be more than 0 m"),
+        (["--log", "1", "--radius", "0"], "--radius must be more than 0 and up to 100000 m"),
+        (["--log", "1", "--radius", "1e200"], "up to 100000 m, not 1e+200"),
         (["--log", "1", "--expires", "soon"], "--expires soon is no day"),
         (["--log", "1", "--surveyed", "2025-07-11", "--expires", "2025-07-11"], "--expires 2025-07-11 must be after"),
         (["--log", "1", "--surveyed", "2025-07-11", "--expires", "2024-07-11"], "must be after --surveyed 2025-07-11"),

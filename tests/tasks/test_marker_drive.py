@@ -150,6 +150,17 @@ def test_a_pause_longer_than_the_memory_is_a_new_start():
         assert (gap.remembered, bool(gap.guidance.valid.any())) == (remembered, remembered)
 
 
+@pytest.mark.parametrize("interval", [None, 0.5])
+def test_residuals_do_not_compare_across_a_pause(interval):
+    """Regression: with `residual_interval=None` the frame before the pause counted, wherever the vehicle was then."""
+    for pause, compared in ((2.0, interval is None), (1000.0, False)):
+        drive = MarkerDrive(MarkerReader(STORE, ReaderConfig(residual_interval=interval)))
+        drive.step(seen_from(0.0), 0, ego(0.0))
+        after = drive.step(seen_from(0.0), round(pause * SECOND), ego(500.0))  # the boards have moved along, too
+        residual = np.asarray(after.reading.observed.markers.residual)
+        assert (residual.max() > 400.0) == compared
+
+
 @pytest.mark.parametrize(
     ("fusion", "trust", "gate"),
     [

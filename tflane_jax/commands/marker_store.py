@@ -18,11 +18,13 @@ from tflane_jax.plots.tables import format_table
 from tflane_jax.scene.logs import Log
 from tflane_jax.world.simulate import simulate
 
+_LARGEST_RADIUS = 1e5  # metres
+
 
 def run(options: argparse.Namespace) -> int:
     """Write a store, read it back, and print its content."""
-    if not options.radius > 0.0:
-        raise UserError(f"--radius must be more than 0 m, not {options.radius:g}")
+    if not 0.0 < options.radius <= _LARGEST_RADIUS:
+        raise UserError(f"--radius must be more than 0 and up to {_LARGEST_RADIUS:g} m, not {options.radius:g}")
     surveyed, expires = day_of(options.surveyed, "--surveyed"), day_of(options.expires, "--expires")
     if surveyed is not None and expires is not None and expires <= surveyed:
         raise UserError(f"--expires {expires} must be after --surveyed {surveyed}: before it, no entry would be valid")

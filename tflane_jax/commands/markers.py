@@ -16,8 +16,9 @@ detections.json:
 from __future__ import annotations
 
 import argparse
-import os
+import re
 import sys
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -27,10 +28,10 @@ from jaxtyping import Float, UInt8
 
 from tflane_jax.commands.sources import make_folder
 from tflane_jax.datasets.plausible import LARGEST_DISTORTION, MOST_PIXELS
-from tflane_jax.errors import UserError
+from tflane_jax.errors import LeftOutWarning, UserError
 from tflane_jax.files.atomic import check_folder, check_replaces, write_bytes, write_json
 from tflane_jax.files.images import check_centre, list_photos, opencv, read_image, undistorted
-from tflane_jax.files.wording import check_name, plain_name
+from tflane_jax.files.wording import check_name, plain_name, short_stem
 from tflane_jax.geometry.cameras import project
 from tflane_jax.limits import check_settings
 from tflane_jax.markers.curves import CurveConfig, Sighting, measure, summarise
@@ -40,6 +41,7 @@ from tflane_jax.markers.square_pose import marker_outline
 from tflane_jax.plots import format_table, save_table, style
 from tflane_jax.plots.marker_curves import save_error_curves
 from tflane_jax.plots.marker_drive import OUTCOMES
+from tflane_jax.plots.tables import counted
 from tflane_jax.scene import CameraViews
 from tflane_jax.scene.marker_patterns import MarkerFamily, board_size
 from tflane_jax.world.render.camera import camera_pose
@@ -48,7 +50,7 @@ _AXES = np.array([(255, 40, 40), (40, 200, 40), (60, 90, 255)])
 _OUTLINE, _CONTRADICTORY, _DARK = (255, 210, 0), style.rgb(OUTCOMES["contradictory"]), style.rgb(style.ROAD)
 
 _HIGHEST = 100.0  # of a camera above the ground, metres
-_LONGEST_STEM = 200  # bytes of a photo's name in that of its picture
+_PICTURE = re.compile(r"\d{3,}-.*-markers\.png")
 
 Box = tuple[int, int, int, int]
 
@@ -61,7 +63,7 @@ def find(options: argparse.Namespace) -> int:
     """
     check_folder(options.out)
     opencv()  # without it, every photo would be a fault
-    photos = list_photos(options.images)
+    photos = _without_own_pictures(list_photos(options.images), options)
     config = DetectorConfig(
         _family(options.family),
         options.size,
@@ -86,7 +88,7 @@ def find(options: argparse.Namespace) -> int:
     if not abs(options.pitch) <= 90.0:
         raise UserError(f"--pitch is from -90 to 90 degrees, not {options.pitch:g}")
     intrinsics, pose = _intrinsics(options.intrinsics), camera_pose(options.height, np.deg2rad(options.pitch))
-    pictures = {path: f"{number:03d}-{_short(path.stem)}-markers.png" for number, path in enumerate(photos)}
+    pictures = {path: f"{number:03d}-{short_stem(path)}-markers.png" for number, path in enumerate(photos)}
     check_replaces({options.out / name: path for path, name in pictures.items()}, photos)
     make_folder(options.out)
     rows, records, faults, twice = [], [], [], []
@@ -95,7 +97,7 @@ def find(options: argparse.Namespace) -> int:
             check_name(path)
             photo = read_image(path)
             check_centre(path, photo, intrinsics)
-            photo = undistorted(photo, intrinsics, distortion)
+            photo = undistorted(path, photo, intrinsics, distortion)
             found = detect(_views(photo, intrinsics, pose), config)
             _write_picture(options.out / picture, photo, found, config.size, config.family, intrinsics, pose)
         except UserError as error:
@@ -182,9 +184,25 @@ def _family(name: str) -> MarkerFamily:
     return MarkerFamily[name]
 
 
-def _short(stem: str) -> str:
-    """Return the part of a name to which others can be added: file systems allow 255 bytes."""
-    return os.fsencode(stem)[:_LONGEST_STEM].decode(errors="ignore")
+def _without_own_pictures(photos: list[Path], options: argparse.Namespace) -> list[Path]:
+    """Return the photos without pictures that an earlier run wrote into their folder; warn of these.
+
+    A file that is named itself is what the user means.
+    """
+    out = options.out.resolve()
+    own = [
+        path
+        for path in photos
+        if _PICTURE.fullmatch(path.name) and path.parent.resolve() == out and path not in options.images
+    ]
+    if own:
+        pictures = counted(len(own), "picture")
+        warnings.warn(
+            f"{pictures} of an earlier run in {options.out} left out: {own[0].name}", LeftOutWarning, stacklevel=2
+        )
+    if len(own) == len(photos):
+        raise UserError(f"{options.out} holds no photos but pictures of an earlier run: name the photos")
+    return [path for path in photos if path not in own]
 
 
 def _intrinsics(numbers: list[float]) -> Float[np.ndarray, "3 3"]:

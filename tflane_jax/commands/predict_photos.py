@@ -28,9 +28,9 @@ from tflane_jax.commands.sources import make_folder
 from tflane_jax.datasets.photos import PhotoCamera, Placement, fit_photo, misfits
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import check_replaces, write_json
-from tflane_jax.files.images import PHOTO_SUFFIXES, list_photos, opencv, read_image
+from tflane_jax.files.images import LARGEST_SIDE, PHOTO_SUFFIXES, list_photos, opencv, read_image
 from tflane_jax.files.videos import VIDEO_SUFFIXES, read_frames, sample_frames, video_info, writing_video
-from tflane_jax.files.wording import check_name, plain_name
+from tflane_jax.files.wording import check_name, plain_name, short_stem
 from tflane_jax.plots.figure import new_figure
 from tflane_jax.plots.images import lanes_drawn, save_photo
 from tflane_jax.plots.tables import counted
@@ -40,12 +40,11 @@ from tflane_jax.tasks.photo_lanes import PhotoLanes, PhotoReader
 
 # Frames of a video in which its view is searched, and points of a lane in its record.
 _SEARCHED_FRAMES, _VIDEO_POINTS = 4, 20
-# Seconds between two states of predictions.json: a run of hours that is killed keeps almost all of its answers.
-_SAVED_EVERY = 10.0
+# Seconds between two states of predictions.json: a run of hours that is killed keeps almost all of its answers. Those
+# of a long video take longer to write; then less often, so that writing takes at most this fraction of the time.
+_SAVED_EVERY, _SAVING = 10.0, 0.05
 # Least fraction of the frames in its header that a whole video has; headers are not exact.
 _WHOLE = 0.95
-# OpenCV samples no larger pictures.
-_LARGEST_SIDE = 2**15 - 2
 
 
 def predict(trained: Run, paths: list[Path], options: argparse.Namespace) -> int:
@@ -68,9 +67,13 @@ def predict(trained: Run, paths: list[Path], options: argparse.Namespace) -> int
     report = _Report(options.out / "predictions.json", head)
     try:
         for path in progress_bar(photos, desc="predict", unit="photo", disable=not photos):
-            report.add("photos", path, lambda path=path: _photo(reader, path, options.out / names[path], camera))
+            report.add("photos", path, lambda _, path=path: _photo(reader, path, options.out / names[path], camera))
         for path in videos:
-            report.add("videos", path, lambda path=path: _video(reader, path, options.out / names[path], camera))
+            report.add(
+                "videos",
+                path,
+                lambda so_far, path=path: _video(reader, path, options.out / names[path], camera, so_far),
+            )
         report.content["complete"] = True
     finally:
         report.save()
@@ -94,34 +97,54 @@ def predict(trained: Run, paths: list[Path], options: argparse.Namespace) -> int
     return 2 if faults else 0
 
 
+SoFar = Callable[[dict[str, Any]], None]
+"""Takes the record of a file that is still being read."""
+
+
 class _Report:
     """The content of predictions.json, written now and then, so that a run that is stopped keeps its answers."""
 
     def __init__(self, path: Path, head: dict[str, Any]) -> None:
         self.content: dict[str, Any] = head | {"complete": False, "photos": [], "videos": [], "faults": []}
-        self._path, self._saved = path, time.monotonic()
+        self._path, self._next = path, time.monotonic() + _SAVED_EVERY
 
-    def add(self, kind: str, path: Path, read: Callable[[], dict[str, Any]]) -> None:
-        """Append what `read` returns, or the fault of its UserError."""
+    def add(self, kind: str, path: Path, read: Callable[[SoFar], dict[str, Any]]) -> None:
+        """Append what `read` returns, or the fault of its UserError.
+
+        While it reads, `read` may give the record as it is so far.
+        """
+        records = self.content[kind]
+        place = len(records)
+
+        def put(record: dict[str, Any]) -> None:
+            records[place:] = [record]
+            self._save_now_and_then()
+
         try:
             check_name(path)
-            self.content[kind].append(read())
+            put(read(put))
         except UserError as error:
+            del records[place:]
             self.content["faults"].append({"file": plain_name(path), "error": str(error)})
-        if time.monotonic() - self._saved > _SAVED_EVERY:
+            self._save_now_and_then()
+
+    def _save_now_and_then(self) -> None:
+        if time.monotonic() > self._next:
             self.save()
 
     def save(self) -> None:
         """Write the file."""
+        begun = time.monotonic()
         write_json(self._path, self.content)
-        self._saved = time.monotonic()
+        now = time.monotonic()
+        self._next = now + max(_SAVED_EVERY, (now - begun) / _SAVING)
 
 
 def _photo(reader: PhotoReader, path: Path, out: Path, camera: PhotoCamera | None) -> dict[str, Any]:
     photo = read_image(path)
-    if max(photo.shape) > _LARGEST_SIDE:
+    if max(photo.shape) > LARGEST_SIDE:
         height, width = photo.shape[:2]
-        raise UserError(f"{path} has {width} x {height} pixels, more than {_LARGEST_SIDE} on a side: make it smaller")
+        raise UserError(f"{path} has {width} x {height} pixels, more than {LARGEST_SIDE} on a side: make it smaller")
     answer = reader.read(photo, camera)
     count = len(answer.lanes)
     save_photo(out, photo, answer.lanes, f"{path.name}: {counted(count, 'lane line')}")
@@ -131,7 +154,7 @@ def _photo(reader: PhotoReader, path: Path, out: Path, camera: PhotoCamera | Non
     return size | {"picture": out.name} | found | {"lanes": _plain(answer)}
 
 
-def _video(reader: PhotoReader, path: Path, out: Path, camera: PhotoCamera | None) -> dict[str, Any]:
+def _video(reader: PhotoReader, path: Path, out: Path, camera: PhotoCamera | None, so_far: SoFar) -> dict[str, Any]:
     """Write the video with its lanes; all frames are seen in one view, because they have one camera."""
     info = video_info(path)
     some = sample_frames(path, _SEARCHED_FRAMES)
@@ -143,6 +166,12 @@ def _video(reader: PhotoReader, path: Path, out: Path, camera: PhotoCamera | Non
         warning = "no view of its frames shows plausible lanes, and no video is written: give --horizon and --focal"
         return head | {"video": None, "view": None, "warning": warning, "frames": []}
     frames, doubtful = [], 0
+    unfinished = head | {
+        "video": None,
+        "view": _plain_view(view),
+        "warning": "not all frames were read",
+        "frames": frames,
+    }
     of_all = "; ".join(misfits(view, horizon)) if known else ""
     with writing_video(out, info) as writer:
         for frame in progress_bar(read_frames(path), desc=path.name, unit="frame", total=info.frames or None):
@@ -150,6 +179,7 @@ def _video(reader: PhotoReader, path: Path, out: Path, camera: PhotoCamera | Non
             writer.add(lanes_drawn(frame, answer.lanes))
             frames.append(_plain(answer, _VIDEO_POINTS))
             doubtful += answer.warning not in ("", of_all)
+            so_far(unfinished)
     few = f"{doubtful} of {len(frames)} frames are doubtful or empty" if doubtful else ""
     cut = len(frames) < _WHOLE * info.frames
     lost = f"only {len(frames)} of {info.frames} frames could be read: is the file whole?" if cut else ""
@@ -170,12 +200,13 @@ def _plain_view(view: Placement) -> dict[str, int]:
 
 
 def _names(inputs: list[Path]) -> list[str]:
-    """Return a file name for each input's picture; of equal names, all but the first get numbers."""
+    """Return a file name for each input's picture; of equal names, all but the first get numbers, long ones are cut."""
     taken: set[str] = set()
     names = []
     for path in inputs:
         suffix = ".mp4" if path.suffix.lower() in VIDEO_SUFFIXES else ".png"
-        stems = itertools.chain([path.stem], (f"{path.stem}-{count}" for count in itertools.count(2)))
+        name = short_stem(path)
+        stems = itertools.chain([name], (f"{name}-{count}" for count in itertools.count(2)))
         stem = next(stem for stem in stems if stem.lower() not in taken)  # some file systems ignore case
         taken.add(stem.lower())
         names.append(f"{stem}-lanes{suffix}")

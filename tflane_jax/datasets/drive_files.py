@@ -97,15 +97,15 @@ class Drive:
         images: dict[int, UInt8[np.ndarray, "h w 3"]] = {}
         for number, camera in enumerate(self.cameras):
             if camera.name in frame.images:
+                path = frame.images[camera.name]
                 try:
-                    image = read_image(frame.images[camera.name])
-                    self._check_size(camera, frame.images[camera.name], image)
+                    image = read_image(path)
+                    self._check_size(camera, path, image)
+                    images[number] = undistorted(path, image, camera.intrinsics, camera.distortion)
                 except UserError as error:
                     if faults is None:
                         raise
-                    faults[str(frame.images[camera.name])] = str(error)
-                    continue
-                images[number] = undistorted(image, camera.intrinsics, camera.distortion)
+                    faults[str(path)] = str(error)
         sizes = np.array([self._size(camera) or (0, 0) for camera in self.cameras], np.int32)
         count, (width, height) = len(self.cameras), np.maximum(sizes.max(0), 1)
         views = CameraViews(

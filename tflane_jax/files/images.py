@@ -20,6 +20,8 @@ from jaxtyping import Float, UInt8
 from tflane_jax.errors import LeftOutWarning, UserError, missing_extra
 
 PHOTO_SUFFIXES = (".bmp", ".gif", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp")
+LARGEST_SIDE = 2**15 - 2
+"""Pixels; OpenCV samples no larger pictures."""
 _NAMED = 3  # files in a message
 # Place of the principal point, as fractions of width and height, outside of which an image is of another size.
 _SCALED = (0.3, 0.75)
@@ -100,7 +102,8 @@ def unreadable(path: Path) -> str | None:
 def read_image(path: Path) -> UInt8[np.ndarray, "h w 3"]:
     """Return a photo as 8-bit RGB, turned upright as its EXIF record says; transparency is dropped.
 
-    A JPEG decodes to the pixels of `cv2.imread`, with the channels turned round. Raises UserError where the file cannot
+    A JPEG decodes to the pixels of `cv2.imread`, with the channels turned round. Transparent parts of a TIFF are
+    blended with black. Raises UserError where the file cannot
     be read, is empty, cut off, or no image of a known format with 8 or 16 bits a channel. Warns of 16-bit images that
     use few of their bits.
     """
@@ -153,17 +156,26 @@ def check_centre(path: Path, image: UInt8[np.ndarray, "h w 3"], intrinsics: Floa
 
 
 def undistorted(
-    image: UInt8[np.ndarray, "h w 3"], intrinsics: Float[np.ndarray, "3 3"], distortion: Sequence[float]
+    path: Path, image: UInt8[np.ndarray, "h w 3"], intrinsics: Float[np.ndarray, "3 3"], distortion: Sequence[float]
 ) -> UInt8[np.ndarray, "h w 3"]:
     """Return an image as a pinhole camera would take it.
 
     Args:
+        path: of the image, for messages.
         image: of a camera with lens distortion.
         intrinsics: pixels from the corner of the image; those of the result too.
         distortion: OpenCV's K1 K2 P1 P2, with K3, or with K3 to K6; empty returns the image itself.
+
+    Raises UserError for an image with a side that is too long for OpenCV.
     """
     if not len(distortion):
         return image
+    if max(image.shape) > LARGEST_SIDE:
+        height, width = image.shape[:2]
+        raise UserError(
+            f"{path} has {width} x {height} pixels; lens distortion can be removed up to {LARGEST_SIDE} on a side: "
+            "make it smaller, and its intrinsics"
+        )
     # OpenCV's pixel origin is the centre of the first pixel, ours its corner.
     shifted = intrinsics - np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])
     return opencv().undistort(image, shifted, np.array(distortion))

@@ -68,8 +68,13 @@ def read_frames(path: Path) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
 
 
 def sample_frames(path: Path, count: int) -> list[UInt8[np.ndarray, "h w 3"]]:
-    """Return some frames spread over a video, at least the first; raises UserError as `read_frames`."""
+    """Return some frames spread over a video, at least the first; raises UserError as `read_frames`.
+
+    A video whose header does not tell how many it has is read once from start to end.
+    """
     cv2, total = opencv(), video_info(path).frames
+    if total == 0:
+        return _spread(read_frames(path), count)
     found = [next(read_frames(path))]
     with _opened(path) as video:
         for i in range(1, count):
@@ -78,6 +83,19 @@ def sample_frames(path: Path, count: int) -> list[UInt8[np.ndarray, "h w 3"]]:
             if read and frame.shape == found[0].shape:
                 found.append(cv2.cvtColor(frame, cv2.COLOR_BGR2RGB))
     return found
+
+
+def _spread(frames: Iterator[UInt8[np.ndarray, "h w 3"]], count: int) -> list[UInt8[np.ndarray, "h w 3"]]:
+    """Return `count` of any number of frames; at most twice as many are kept at a time."""
+    kept: list[UInt8[np.ndarray, "h w 3"]] = []
+    step = 1
+    for number, frame in enumerate(frames):
+        if number % step == 0:
+            if len(kept) == 2 * count:
+                kept, step = kept[::2], 2 * step
+            if number % step == 0:
+                kept.append(frame)
+    return [kept[i * len(kept) // count] for i in range(count)] if len(kept) > count else kept
 
 
 class VideoWriter:
@@ -103,7 +121,8 @@ def writing_video(path: Path, info: VideoInfo) -> Iterator[VideoWriter]:
     with replacing(path) as temporary:
         partial = temporary.with_name(temporary.name + ".mp4")  # OpenCV chooses the format by the suffix
         code = cv2.VideoWriter.fourcc(*"mp4v")
-        writer = cv2.VideoWriter(str(partial), code, info.rate, (info.width, info.height))
+        with quiet_opencv():
+            writer = cv2.VideoWriter(str(partial), code, _writable_rate(info.rate), (info.width, info.height))
         try:
             if not writer.isOpened():
                 raise UserError(f"OpenCV cannot write {path}: check the folder, or install OpenCV with FFmpeg")
@@ -113,6 +132,12 @@ def writing_video(path: Path, info: VideoInfo) -> Iterator[VideoWriter]:
         finally:
             writer.release()
             partial.unlink(missing_ok=True)
+
+
+def _writable_rate(rate: float) -> float:
+    """Return the rate, rounded where MPEG-4 cannot count its ticks, of which a second has at most 65,535."""
+    exact = (round(rate, digits) for digits in (3, 2, 1) if round(rate, digits) * 10**digits < 2**16)
+    return next(exact, round(rate))
 
 
 @contextlib.contextmanager

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import reprlib
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,7 +12,7 @@ import numpy as np
 
 from tflane_jax.errors import UserError
 
-_LONGEST_NAME = 200
+_LONGEST_NAME, _LONGEST_STEM = 200, 200
 _NAMED = 3
 
 
@@ -40,6 +41,11 @@ def check_name(path: Path) -> None:
 def plain_name(path: Path) -> str:
     """Return a name for reports, in which bytes that are not UTF-8 are escaped."""
     return str(path).encode(errors="backslashreplace").decode()
+
+
+def short_stem(path: Path) -> str:
+    """Return the part of a file's name to which a suffix of some 50 bytes can be added: file systems allow 255."""
+    return os.fsencode(path.stem)[:_LONGEST_STEM].decode(errors="ignore")
 
 
 def kind(value: Any) -> str:

@@ -50,7 +50,7 @@ class OccludedMarker(NamedTuple):
     Attributes:
         marker_id: identity.
         corners: pixels.
-        wrong_bits: cells that do not read as printed, hidden ones included.
+        wrong_bits: cells that do not read as printed, those of the border and hidden ones included.
         explained: fraction of the board that is as bright as printed.
     """
 
@@ -123,7 +123,8 @@ def _identify(
     certain = explained >= _EXPLAINED or dirty
     if not certain or _inner_explained(grey, final, cells, levels) < _INNER:
         return None
-    return OccludedMarker(read.marker_id, final, again.wrong, explained)
+    of_border = int((rings(n + 2)[1] & (levels.read >= 0.0)).sum())
+    return OccludedMarker(read.marker_id, final, again.wrong + of_border, explained)
 
 
 def _inside(point: Float[np.ndarray, "2"], corners: Float[np.ndarray, "4 2"]) -> bool:
@@ -136,7 +137,7 @@ def _inside(point: Float[np.ndarray, "2"], corners: Float[np.ndarray, "4 2"]) ->
 
 
 class _Read(NamedTuple):
-    """An id, the quarter turns of its pattern in the quad, and the number of cells that do not read as printed."""
+    """An id, the quarter turns of its pattern in the quad, and how many inner cells do not read as printed."""
 
     marker_id: int
     turns: int

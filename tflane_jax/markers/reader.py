@@ -110,6 +110,10 @@ class MarkerReader:
             self._past.popleft()
         return Reading(detected, observed)
 
+    def forget(self) -> None:
+        """Begin another drive: the residuals of the next frame compare with none before it."""
+        self._past.clear()
+
     def _earlier(self, timestamp_ns: int) -> _Past | None:
         """Return the frame that the residual compares with, None without one."""
         interval = self.config.residual_interval

@@ -139,9 +139,11 @@ class MarkerDrive:
         found: Sequence[ImageMarkers] | None = None,
     ) -> DriveStep:
         """Return the markers and lanes of the next frame; arguments as of `MarkerReader.read`."""
+        continues = self._last is not None and timestamp_ns - self._last[0] <= self._longest_ns
+        if not continues:
+            self.reader.forget()
         reading = self.reader.read(views, timestamp_ns, global_from_ego, found)
         markers = reading.observed.markers
-        continues = self._last is not None and timestamp_ns - self._last[0] <= self._longest_ns
         before = self._last[1] if self._last is not None and continues else global_from_ego
         example = replace(
             blank(self._sizes, governed="lanes", views=None, traffic=True),

@@ -8,9 +8,10 @@ import pytest
 
 from tests.fakes import POINTS, FakeConfig, FakeDataset, fake_example, fake_segments, fake_views
 from tflane_jax.commands import predict_lanes
-from tflane_jax.config import RunConfig
+from tflane_jax.config import EvaluationConfig, RunConfig
 from tflane_jax.datasets.procedural import SimulatedDataset
 from tflane_jax.errors import UserError
+from tflane_jax.evaluation.geometric_topology import edge_confidences, geometric_edges
 from tflane_jax.runs import Run
 from tflane_jax.scene import Prediction, stack_examples
 
@@ -42,6 +43,27 @@ def test_prediction_of_segments_adds_boundaries_and_types(tmp_path, monkeypatch)
     monkeypatch.setattr(predict_lanes.sources, "make_dataset", lambda *_: dataset)
     with pytest.raises(UserError, match="--cameras renders scenes of the built-in world, and fake has none"):
         predict_lanes.predict(Run("run", RunConfig(), 1, ({},)), options)
+
+
+def test_predicted_edges_are_those_that_are_evaluated(tmp_path, monkeypatch, capsys):
+    """Regression: those of a run with `evaluation.topology` "geometric" were the learned ones."""
+    dataset, segments = FakeDataset(FakeConfig(2)), fake_segments()
+    answer = stack_examples([dataset.example(0)]), Prediction(segments=stack_examples([segments]))
+    monkeypatch.setattr(predict_lanes, "source_for", lambda *_: RunConfig().data.source("val"))
+    monkeypatch.setattr(predict_lanes.sources, "open_dataset", lambda *_: dataset)
+    monkeypatch.setattr(predict_lanes, "predict_examples", lambda *_: answer)
+    found = {}
+    for topology in ("learned", "geometric"):
+        options = Namespace(count=1, out=tmp_path / topology, threshold=0.5, max_instances=None, cameras=False)
+        config = RunConfig(evaluation=EvaluationConfig(topology=topology, traffic="none"))
+        assert predict_lanes.predict(Run("run", config, 1, ({},)), options) == 0
+        assert (
+            "evaluation.traffic none; these are predictions with the traffic of each frame" in capsys.readouterr().err
+        )
+        found[topology] = np.load(tmp_path / topology / "predictions.npz")["successor"][0]
+    points, logits = np.asarray(segments.points), np.asarray(segments.successor_logits)
+    np.testing.assert_allclose(found["geometric"], edge_confidences(points, logits, "geometric"), rtol=1e-6)
+    np.testing.assert_allclose(found["geometric"] - found["learned"], geometric_edges(points), atol=1e-6)
 
 
 @pytest.mark.slow

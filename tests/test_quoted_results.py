@@ -18,6 +18,7 @@ PAGES = (
     "docs/tf_lane.md",
     "docs/tf_lane_results.md",
     "docs/marker_results.md",
+    "docs/cameras.md",
     "docs/small_models.md",
     "docs/real_roads.md",
     "docs/gtn_lane.md",

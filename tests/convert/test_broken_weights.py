@@ -116,7 +116,7 @@ def test_tensors_of_zeros_are_refused(name, said, path):
         load_lstr(write(path, state), TINY)
 
 
-@pytest.mark.parametrize("prefix", ["module.", "model.", "module.module.", "model.module."])
+@pytest.mark.parametrize("prefix", ["module.", "model.", "module.module.", "model.module.", "_orig_mod."])
 def test_what_is_around_the_network_is_no_part_of_its_names(prefix, path):
     plain = load_lstr(write(path, lstr_state()), TINY)
     wrapped = load_lstr(write(path, {prefix + name: tensor for name, tensor in lstr_state().items()}), TINY)
@@ -231,6 +231,8 @@ def test_doubles_become_floats_and_counters_may_hold_anything(path):
     params, _ = load_lstr(write(path, state), TINY)
     doubles = {name: tensor.astype(np.float64) for name, tensor in state.items()}
     doubles["layer1.0.bn1.num_batches_tracked"] = np.array(np.nan)
+    doubles["n_averaged"] = np.array(7)  # of torch.optim.swa_utils
+    doubles["ema_conv1_weight"] = state["conv1.weight"] + 1.0  # of MMCV, beside the weights
     again, _ = load_lstr(write(path, doubles), TINY)
     jax.tree.map(np.testing.assert_array_equal, params, again)
     assert {leaf.dtype for leaf in jax.tree.leaves(again)} == {np.dtype(np.float32)}

@@ -136,6 +136,7 @@ BAD = {
     "no feature": ({"type": "Way"}, "feature 1 is no GeoJSON Feature"),
     "a list": ([], "feature 1 is no GeoJSON Feature"),
     "geometry": (feature(LINE, "Line", highway="road"), "feature 1 has a geometry of type 'Line'"),
+    "collection": (feature(LINE, "GeometryCollection", highway="road"), "feature 1 is a road as GeometryCollection"),
     "named": (feature(7, highway="road") | {"id": "way/12"}, r"feature 1 \(way/12\) is no line"),
 }
 

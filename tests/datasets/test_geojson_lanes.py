@@ -108,6 +108,9 @@ def test_a_successor_that_is_listed_twice_is_one(tmp_path):
     streets[0]["properties"]["successors"] = [2, 2, "2"]
     found = read_lanes(write(tmp_path / "town.geojson", streets)).map
     assert found.segments[0].successors == (2,)
+    for i, street in enumerate(streets):  # a column of numbers with an empty cell is one of floats
+        street["properties"]["lane"] = float(i)
+    assert read_lanes(write(tmp_path / "town.geojson", streets)).map.segments[0].successors == (2,)
 
 
 def test_a_map_as_tables_are_exported(tmp_path):
@@ -161,6 +164,8 @@ ARM = [(0, 0), (80, 0)]
         ([lane(1, *ARM, bicycle="yes")], "feature 0: bicycle is 'yes', expected true or false"),
         ([lane(1, *ARM, left=["solid"])], r"feature 0: left is \['solid'\], expected one of none"),
         ([shaped(lane(1), "MultiLineString", [place(*ARM), place(*ARM)])], "lane 1 is a MultiLineString of 2 lines"),
+        ([lane(1, *ARM), shaped(lane(2), "GeometryCollection", [])], "feature 1 is a GeometryCollection: give each of"),
+        ([lane(1.5, *ARM)], "feature 0: lane is 1.5, expected an id"),
         ([shaped(lane(1), "Polygon", [place(*CORNERS)])], "lane 1 is a Polygon of 1 lines"),
         ([shaped(lane(1), "MultiPolygon", 7)], "feature 0: coordinates is of type int, expected a list"),
         (

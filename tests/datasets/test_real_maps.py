@@ -97,6 +97,8 @@ def test_splits_take_the_logs_that_they_name_and_training_the_others():
     assert (unnamed.logs, unnamed.without) == ((), ("b",))
     recorded = replace(data, test_on="recordings", test_traffic="a").source("test")
     assert recorded == RecordedConfig(Path("x"), ("b", "c"), traffic="a")
+    unnamed = replace(data, test_logs=(), without=("d",), test_on="recordings").source("test")
+    assert unnamed == RecordedConfig(Path("x"), (), ("a", "d"))  # not those of the validation
     assert replace(data, without=("d",)).source("train").without == ("a", "b", "c", "d")
     assert source_of(recorded).name == "recorded"
     assert RecordedData(Path("x"), test=("b",)).source("train").without == ("b",)

@@ -121,6 +121,15 @@ def test_a_folder_without_maps_or_with_a_name_twice_is_refused(tmp_path):
         find_maps(tmp_path)
 
 
+def test_a_renamed_copy_of_a_scene_is_the_same_scene(tmp_path):
+    """Regression: under another name of its file, a test scene was in the training data, too."""
+    for name in ("scene-0061", "0061-backup"):
+        np.savez(tmp_path / f"{name}.npz", **content())
+    with pytest.raises(UserError, match=r"two maps with the name scene-0061: take out .*backup.npz or .*0061.npz"):
+        find_maps(tmp_path)
+    assert [one.name for one in find_maps(tmp_path / "0061-backup.npz")] == ["scene-0061"]
+
+
 def test_folders_that_links_lead_to_twice_are_read_once(tmp_path):
     (tmp_path / "maps" / "town").mkdir(parents=True)
     write(tmp_path / "maps" / "town" / "town.geojson", crossroads_features())

@@ -27,6 +27,7 @@ from tflane_jax.metrics import bootstrap as module
 from tflane_jax.metrics.bootstrap import bootstrap_mean, bootstrap_precisions, frame_numbers
 from tflane_jax.metrics.map_matching import match_map
 from tflane_jax.metrics.matching import average_precision_11, average_precision_area
+from tflane_jax.metrics.segment_matching import CROSSING, AreaDetections, AreaTruth
 
 # Two frames a scene; the last sample lacks a scene that has a frame of its own kind.
 SCENE = np.array([0, 0, 1, 1, 2, 2])
@@ -166,7 +167,8 @@ def test_a_sample_has_the_numbers_of_scenes_that_are_really_repeated(case):
         for scene in np.repeat(np.arange(3), times):
             for number in np.flatnonzero(scene == SCENE):
                 add(again, number, frame)
-        expected = flat(again.compute())
+        sampled = hasattr(again, "compute_sample")  # groups have none
+        expected = again.compute_sample(metrics) if sampled else flat(again.compute())
         # Without centerlines there is no class of them, and without frames of a group fewer of its numbers.
         assert times.min() == 0 or samples.keys() <= expected.keys()
         for name in samples.keys() & expected.keys():
@@ -181,6 +183,54 @@ def test_a_sample_has_the_numbers_of_scenes_that_are_really_repeated(case):
     assert of_merged.keys() == samples.keys()
     for name, values in samples.items():
         np.testing.assert_array_equal(of_merged[name], values, err_msg=name)
+
+
+def test_what_a_sample_lacks_does_not_count_in_its_means():
+    """Regression: detections of an attribute or a category that a sample has none of made it 0."""
+    centerline, segment = CenterlineMetrics(), LaneSegmentMetrics("LaneSegNet")
+    devkit = LaneSegmentMetrics()
+    for number in range(2):
+        lanes, truth = random_frame(number, lanes=3, detections=4)
+        box = np.array([[[0.0, 0.0], [9.0, 9.0]]])
+        elements = ElementDetections(
+            boxes=np.concatenate([box, box + 50.0]),
+            attributes=np.array([number, 1 - number]),
+            scores=np.array([0.9, 0.1]),
+            lane=np.zeros((4, 2)),
+        )
+        true = ElementTruth(boxes=box, attributes=np.array([number]), lane=np.zeros((3, 1), bool))
+        centerline.update(dataclasses.replace(lanes, elements=elements), dataclasses.replace(truth, elements=true))
+        found, there = random_segments(np.random.default_rng(number))
+        ring = np.array([[0.0, 0.0], [0.0, 4.0], [9.0, 4.0], [9.0, 0.0], [0.0, 0.0]])
+        ring = np.pad(np.repeat(ring, 4, 0), ((0, 0), (0, 1)))
+        areas = AreaDetections([ring], np.array([CROSSING]), np.array([0.9 - 0.5 * number]))
+        real = AreaTruth([ring] * (1 - number), np.array([CROSSING] * (1 - number), int))
+        for metrics in (segment, devkit):
+            metrics.update(dataclasses.replace(found, areas=areas), dataclasses.replace(there, areas=real))
+    weights = np.array([[1, 1], [2, 0], [0, 2]])
+    # Eleven attributes have neither truths nor detections, which is 1 officially; of two each frame has one.
+    assert centerline.compute()["DET_t"] == 1.0
+    np.testing.assert_allclose(centerline.bootstrap(weights)["DET_t"], 1.0)
+    samples = segment.bootstrap(weights)
+    assert samples["AP_ped"].tolist() == [1.0, 1.0, 0.0]
+    np.testing.assert_allclose(samples["mAP"][2], samples["AP_ls"][2])
+    np.testing.assert_allclose(samples["mAP"][:2], (samples["AP_ls"][:2] + 1.0) / 2)
+    # No true boundary and no detection of one: 1 officially, in every sample.
+    np.testing.assert_allclose(devkit.bootstrap(weights)["DET_a"], 1.0)
+
+
+def test_some_frames_have_no_number_of_areas_that_they_lack():
+    metrics = LaneSegmentMetrics("LaneSegNet")
+    found, there = random_segments(np.random.default_rng(0))
+    none = AreaTruth([], np.zeros(0, int))
+    metrics.update(found, dataclasses.replace(there, areas=none))
+    part, whole = metrics.compute("frames"), metrics.compute()
+    assert part.keys() & {"AP_ped", "AP_boundary"} == set()
+    assert part["mAP"] == part["AP_ls"] == whole["AP_ls"]
+    assert whole["mAP"] < whole["AP_ls"]
+    devkit = LaneSegmentMetrics()
+    devkit.update(found, dataclasses.replace(there, areas=none))
+    assert "DET_a" not in devkit.compute("frames")
 
 
 def test_consistency_of_samples():

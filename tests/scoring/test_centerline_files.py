@@ -81,6 +81,18 @@ def data_dict(folder, subset, keys):
     (folder / f"data_dict_subset_{subset}.json").write_text(json.dumps({"train": {}, "val": segments}))
 
 
+def test_a_split_may_be_a_link_to_a_folder_of_another_name(files):
+    """Regression: the link's target gave the split its name, and had no list of frames beside it."""
+    other = [("val", "11000", "5")]
+    write_info(files / "data", [*FRAMES, *other])
+    data_dict(files / "data", "A", FRAMES)
+    data_dict(files / "data", "B", other)
+    (files / "data" / "val").rename(files / "disk")
+    (files / "data" / "val").symlink_to(files / "disk", target_is_directory=True)
+    for truth in ("data", "data/val"):
+        assert run(files)[1]["rows"] == run(files, truth=truth)[1]["rows"]
+
+
 def test_of_a_dataset_the_predicted_subset_alone_is_read(files, capsys):
     """Both subsets may share the folder; a frame that the predictions lack is missed within their own."""
     other = [("val", "11000", "5"), ("val", "11000", "6")]

@@ -1,6 +1,7 @@
 """`tflane score` on this project's own files, and lanes grouped by distance and occlusion."""
 
 import json
+import pickle
 import re
 
 import numpy as np
@@ -107,6 +108,39 @@ def test_arrays_with_empty_slots_give_the_hand_made_numbers(tmp_path):
     single.update(*hand_frame())
     assert rows[0]["TOP_ll"] == pytest.approx(single.compute()["TOP_ll"])
     assert [row["lanes"] for row in rows] == [9, 6, 3]
+
+
+def test_json_leaves_out_what_arrays_leave_out(tmp_path):
+    """Regression: `valid` and `category` had no effect there."""
+    predictions, truths, expected = json_frames()
+    for record in (*predictions, *truths):
+        count = len(record["points"])
+        record["points"] = [[[90.0, 40.0, 0.0], [95.0, 40.0, 0.0]], *record["points"]]
+        record["successor"] = np.pad(record["successor"], ((1, 0), (1, 0)), constant_values=1).tolist()
+        for name in record.keys() & {"scores", "visibility"}:
+            record[name] = [1.0, *record[name]]
+        record |= {"valid": [False] + [True] * count} if "scores" in record else {"category": [1] + [0] * count}
+    write_json(tmp_path, predictions, truths)
+    code, (row,) = run(tmp_path, "json")
+    assert code == 0
+    assert {name: row[name] for name in expected} == pytest.approx(expected)
+
+
+def test_sums_of_two_confidences_are_edges_as_in_official_files(tmp_path):
+    predictions, truths, _ = json_frames()
+    for record in predictions:
+        record["successor"] = (2.0 * np.array(record["successor"])).tolist()
+    write_json(tmp_path, predictions, truths)
+    assert run(tmp_path, "json")[0] == 0
+
+
+def test_the_plain_form_does_not_pair_with_official_files(tmp_path, capsys):
+    predictions, _, _ = json_frames()
+    write_json(tmp_path, predictions, [])
+    record = {"lane_centerline": [], "traffic_element": [], "topology_lclc": [], "topology_lcte": []}
+    (tmp_path / "t.pkl").write_bytes(pickle.dumps({("val", "a", "1"): {"annotation": record}}))
+    assert main(["score", PROTOCOL, str(tmp_path / "p.json"), str(tmp_path / "t.pkl")]) == 2
+    assert "name their frames in different forms: give both" in capsys.readouterr().err
 
 
 def test_crossings_among_segments_are_no_lanes(tmp_path):

@@ -155,6 +155,23 @@ def test_types_and_groups_are_read_from_the_files(tmp_path, by):
         assert rows[near]["AE_type"] == 0.5
 
 
+@pytest.mark.parametrize("side", ["predictions", "annotation"])
+def test_types_in_some_frames_alone_are_refused(tmp_path, capsys, side):
+    """Regression: AE_type was that of the frames that have them, without a word."""
+    corners = np.array([[0, 0, 0], [0, 9, 0], [8, 9, 0], [8, 0, 0], [0, 0, 0]], float)
+    keys = [("val", "1", str(i)) for i in range(2)]
+    records = {"predictions": {}, "annotation": {}}
+    for name, score in (("predictions", 0.9), ("annotation", None)):
+        for i, key in enumerate(keys):
+            record = segment_record(corners, score)
+            records[name][key] = {name: record if name == side and i else typed(record, (1, 2))}
+    (tmp_path / "annotations.pkl").write_bytes(pickle.dumps(records["annotation"]))
+    (tmp_path / "submission.pkl").write_bytes(pickle.dumps({"results": records["predictions"]}))
+    files = [str(tmp_path / name) for name in ("submission.pkl", "annotations.pkl")]
+    assert main(["score", "lanesegnet", *files]) == 2
+    assert "frame val/1/1: its segments have no left_laneline_type, which those of other" in capsys.readouterr().err
+
+
 def test_occlusion_needs_visibility(tmp_path, capsys):
     corners = np.array([[0, 0, 0], [0, 9, 0], [8, 9, 0], [8, 0, 0], [0, 0, 0]], float)
     key = ("val", "1", "1")

@@ -28,6 +28,7 @@ predictions.json, lanes with a score of at least `threshold`, best first:
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -44,6 +45,7 @@ from tflane_jax.datasets.base import Dataset, FrameInfo
 from tflane_jax.datasets.data_source import LaneGraphSource
 from tflane_jax.datasets.procedural import SimulatedDataset
 from tflane_jax.errors import UserError
+from tflane_jax.evaluation.geometric_topology import Topology, edge_confidences
 from tflane_jax.evaluation.predict import predict_examples
 from tflane_jax.files.atomic import replacing, write_json
 from tflane_jax.plots import save_camera_views, save_examples
@@ -72,7 +74,14 @@ def predict(trained: Run, options: argparse.Namespace) -> int:
     indices = spread(len(dataset), options.count)
     examples, answer = predict_examples(task, trained.params[0], dataset, indices)
     infos = [dataset.info(index) for index in indices]
-    arrays = _arrays(answer, infos)
+    evaluation = trained.config.evaluation
+    arrays = _arrays(answer, infos, evaluation.topology)
+    if evaluation.traffic != "own":
+        print(
+            f"tflane: warning: `tflane eval` of this run has evaluation.traffic {evaluation.traffic}; these are "
+            "predictions with the traffic of each frame",
+            file=sys.stderr,
+        )
     frames = [
         _frame(info, {name: array[i] for name, array in arrays.items()}, options.threshold)
         for i, info in enumerate(infos)
@@ -96,17 +105,21 @@ def predict(trained: Run, options: argparse.Namespace) -> int:
     return 0
 
 
-def _arrays(answer: Prediction, infos: Sequence[FrameInfo]) -> dict[str, np.ndarray]:
-    """Return the arrays of predictions.npz."""
+def _arrays(answer: Prediction, infos: Sequence[FrameInfo], topology: Topology = "learned") -> dict[str, np.ndarray]:
+    """Return the arrays of predictions.npz; edges between lanes are those that `tflane eval` measures."""
     lanes, elements = lanes_of(answer), answer.elements
     scores = expit(lanes.logits).max(-1)
     arrays = {"points": np.asarray(lanes.points), "scores": scores}
     if isinstance(lanes, LinePrediction):
         arrays["category"] = np.asarray(lanes.logits).argmax(-1)
     else:
-        edges = lanes.successor_logits
-        none = np.zeros((*scores.shape, scores.shape[-1]))
-        arrays["successor"] = none if edges is None else expit(np.asarray(edges))
+        logits = lanes.successor_logits
+        arrays["successor"] = np.stack(
+            [
+                edge_confidences(points, None if logits is None else np.asarray(logits)[i], topology)
+                for i, points in enumerate(np.asarray(lanes.points))
+            ]
+        )
     if isinstance(lanes, SegmentPrediction):
         arrays |= {"left": np.asarray(lanes.left), "right": np.asarray(lanes.right)}
         arrays["category"] = np.asarray(lanes.logits).argmax(-1)

@@ -18,6 +18,8 @@ from tflane_jax.datasets.nuscenes import NuScenesConfig, NuScenesDataset
 from tflane_jax.datasets.openlane_v2 import OpenLaneV2Config, OpenLaneV2Dataset
 from tflane_jax.errors import UserError
 from tflane_jax.evaluation.centerlines import detections_of_centerlines
+from tflane_jax.evaluation.geometric_topology import Topology
+from tflane_jax.evaluation.interventions import with_traffic
 from tflane_jax.evaluation.lane_segments import detections_of_segments
 from tflane_jax.evaluation.predict import predicted_batches
 from tflane_jax.evaluation.vector_maps import detections_of_lines
@@ -71,8 +73,9 @@ def run(options: argparse.Namespace) -> int:
             raise UserError("this model predicts neither centerlines nor lane segments: OpenLane-V2 has no other task")
         dataset = OpenLaneV2Dataset(source)
         most = options.most_lanes, options.most_elements
+        topology = trained.config.evaluation.topology
         answers = _answers(trained, source, len(dataset))
-        found = {dataset.keys[i]: _record(dataset, answer, *most) for i, answer in answers}
+        found = {dataset.keys[i]: _record(dataset, answer, *most, topology) for i, answer in answers}
         author = Author(
             options.method, tuple(options.authors), options.email, options.institution, options.country, options.team
         )
@@ -99,7 +102,7 @@ def _answers(trained: Run, source: OpenLaneV2Config | NuScenesConfig, frames: in
     assert isinstance(task, LaneGraphTask)  # only it sees such frames
     with showing(True):
         with stage("reading the data"):
-            arrays = task.load(source, progress=True)
+            arrays = with_traffic(task.load(source, progress=True), trained.config.evaluation.traffic)
         batches = predicted_batches(
             task, trained.params[0], arrays, trained.config.evaluation.batch_size, lambda batch: None
         )
@@ -135,18 +138,24 @@ def _tell_size(path: Path) -> None:
 
 
 def _record(
-    dataset: OpenLaneV2Dataset, answer: Prediction, most_lanes: int | None, most_elements: int | None
+    dataset: OpenLaneV2Dataset,
+    answer: Prediction,
+    most_lanes: int | None,
+    most_elements: int | None,
+    topology: Topology = "learned",
 ) -> dict[str, Any]:
-    """Return the best predictions of a frame; a model of both kinds of lanes submits its segments."""
+    """Return the best predictions of a frame; a model of both kinds of lanes submits its segments.
+
+    Edges between lanes are those that `tflane eval` measures: a sum of two confidences with geometry.
+    """
     elements = answer.elements
     if elements is not None:
         boxes = dataset.in_files(np.asarray(elements.box))
         elements = elements.replace(box=boxes)  # pyright: ignore[reportAttributeAccessIssue]
     if answer.segments is not None:
         crossings = "sides" if answer.segments.areas is None else "ring"
-        found = detections_of_segments(answer.segments, elements)
+        found = detections_of_segments(answer.segments, elements, topology)
         return segment_record(best_segments(found, most_lanes, most_elements), crossings)
     assert answer.centerlines is not None
-    return centerline_record(
-        best_lanes(detections_of_centerlines(answer.centerlines, elements), most_lanes, most_elements)
-    )
+    found = detections_of_centerlines(answer.centerlines, elements, topology)
+    return centerline_record(best_lanes(found, most_lanes, most_elements))

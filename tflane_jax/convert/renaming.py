@@ -42,7 +42,7 @@ def convert(state: Mapping[str, AnyArray], rules: Rules, network: str, frozen: s
     """Return variables by our names, and an account of every tensor.
 
     Args:
-        state: tensors by PyTorch's names, with or without the prefixes `module.` and `model.`.
+        state: tensors by PyTorch's names, with or without the prefixes `module.`, `model.` and `_orig_mod.`.
         rules: the first that fits a name decides.
         network: whose tensors these should be, for the message.
         frozen: our paths of norms that never learn, whose scales and biases are statistics too.
@@ -93,8 +93,10 @@ def check_types(others: Mapping[str, str], rules: Rules) -> None:
 def left_out(name: str) -> str | None:
     """Return why a tensor that checkpoints hold beside their weights is not needed."""
     last = name.rpartition(".")[-1]
-    if last in ("num_batches_tracked", "total_ops", "total_params"):
+    if last in ("num_batches_tracked", "total_ops", "total_params", "n_averaged"):
         return "a counter, not needed"
+    if name == last and name.startswith("ema_"):  # of MMCV's hook, beside the weights that were trained
+        return "an average of the weights, not taken"
     # Weights of the coordinates in the loss of MMDetection's heads, all one.
     return "a constant of the loss, not needed" if last == "code_weights" else None
 
@@ -166,7 +168,7 @@ def renamed(name: str, tensor: AnyArray, rules: Rules) -> dict[str, Any] | None:
 
 # Beyond any weight or statistic of a trained network.
 _LARGEST = 1e10
-_WRAPPERS = re.compile(r"(?:(?:module|model)\.)*")
+_WRAPPERS = re.compile(r"(?:(?:module|model|_orig_mod)\.)*")
 # Axes of a weight by the kind of layer; biases have one. Embeddings ("vector", "first_row") may have any.
 _AXES = {"conv": 4, "pointwise": 4, "linear": 2, "packed": 2, "pair": 2, "norm": 1}
 

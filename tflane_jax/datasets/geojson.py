@@ -118,6 +118,8 @@ def read_geojson(path: str | Path) -> RoadLines:
         if not isinstance(kind, str) or kind not in _LINES:
             if kind not in _OTHERS:
                 raise UserError(f"{name} has a geometry of type {shown(kind)}: export roads as LineString")
+            if kind == "GeometryCollection" and _category(feature.get("properties"), name) is not None:
+                raise UserError(f"{name} is a road as GeometryCollection: export roads as LineString")
             continue
         label = _category(feature.get("properties"), name)
         if label is None:

@@ -59,7 +59,11 @@ def read_lanes(path: Path) -> RoadMap:
         kind = str(geometry.get("type"))
         given = {key: value for key, value in properties.items() if value is not None}
         edge, walk = (given.get(one) == 1 for one in ("boundary", "crossing"))  # text is OpenStreetMap's
-        if kind not in _DEPTHS or not (edge or walk or given.keys() & {"lane", "successors"}):
+        if not (edge or walk or given.keys() & {"lane", "successors"}):
+            continue
+        if kind == "GeometryCollection":
+            raise UserError(f"{name} is a GeometryCollection: give each of its lines a feature of its own")
+        if kind not in _DEPTHS:
             continue
         lines = _lines(geometry, kind, name)
         if "lane" in given or not (edge or walk):
@@ -117,6 +121,9 @@ def _metres(line: Float[np.ndarray, "n 2"], origin: Origin, name: str) -> Float[
 
 
 def _identity(value: Any, name: str) -> str:
+    """Return an id as text; that of a table with empty cells may be a whole number in floating point."""
+    if isinstance(value, float) and value.is_integer():
+        value = int(value)
     if isinstance(value, bool) or not isinstance(value, (int, str)):
         raise UserError(f"{name}: lane is {value!r:.40}, expected an id, a number or a text")
     return str(value)

@@ -91,6 +91,14 @@ def scene_file_outline(path: Path) -> LogOutline:
     return _outline(read_npz(path, ("ego_position", "ego_yaw", "meta")), path)
 
 
+def scene_file_name(path: Path) -> str:
+    """Return the name of a scene, that of its log, whatever the file's; of a damaged file its own."""
+    try:
+        return _meta(member(read_npz(path, ("meta",)), "meta", str(path)), f"{path}: meta")[0]
+    except UserError:  # reading the scene tells what is wrong
+        return path.stem
+
+
 def _outline(content: Mapping[str, Any], path: Path) -> LogOutline:
     where = str(path)
     name, period_ns, area = _meta(member(content, "meta", where), f"{path}: meta")

@@ -168,7 +168,7 @@ class RealMapData:
     def source(self, split: Split) -> RealMapConfig | RecordedConfig:
         """Return the dataset of a split."""
         if split == "test" and self.test_on == "recordings":
-            without = () if self.test_logs else self.without
+            without = () if self.test_logs else tuple(sorted({*self.val_logs, *self.without}))
             logs, traffic = self.test_logs, self.test_traffic
             return RecordedConfig(self.maps, logs, without, traffic, self.example, self.loading)
         logs = {"train": (), "val": self.val_logs, "test": self.test_logs}[split]

@@ -19,7 +19,7 @@ from tflane_jax.datasets.argoverse2_poses import POSES
 from tflane_jax.datasets.geojson_lanes import read_lanes
 from tflane_jax.datasets.log_frames import LogOutline
 from tflane_jax.datasets.nuscenes_place import SCENE_TABLE, read_scene, scene_files, scene_outline
-from tflane_jax.datasets.nuscenes_scene_files import read_scene_file, scene_file_outline
+from tflane_jax.datasets.nuscenes_scene_files import read_scene_file, scene_file_name, scene_file_outline
 from tflane_jax.datasets.openlane_maps import map_name, read_segment, segment_files
 from tflane_jax.errors import UserError
 from tflane_jax.files.digests import file_content
@@ -148,7 +148,7 @@ def _found(root: Path) -> Iterator[MapFile]:
     segments: set[Path] = set()
     for file in [root] if root.is_file() else _files(root):
         if file.suffix == ".npz" and _may_hold_lanes(file):
-            yield MapFile(file.stem, (file,), "nuscenes-scenes")
+            yield MapFile(scene_file_name(file), (file,), "nuscenes-scenes")
         elif file.suffix == ".geojson":
             yield MapFile(file.stem, (file,), "geojson")
         elif file.name == ANNOTATIONS:

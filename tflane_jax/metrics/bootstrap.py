@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int, Shaped
+from jaxtyping import Bool, Float, Int, Shaped
 
 from tflane_jax.errors import UserError
 from tflane_jax.metrics.matching import descending
@@ -38,6 +38,15 @@ def checked_weights(weights: Any, frames: int) -> Weights:
     if not np.issubdtype(weights.dtype, np.integer) or (weights < 0).any():
         raise UserError("weights of samples are how often each counts a frame: give integers of 0 and more")
     return weights
+
+
+def kept_in_sample(sample: Int[np.ndarray, "*b"], whole: Int[np.ndarray, "*#b"]) -> Bool[np.ndarray, "*b"]:
+    """Return which classes count in the mean of a sample, given numbers of true elements.
+
+    Those that the whole test set has and the sample lacks do not: officially, their AP is 0 where there are detections
+    of them, which would be the luck of the draw.
+    """
+    return (sample > 0) | (whole == 0)
 
 
 def bootstrap_mean(parts: Float[np.ndarray, "f 2"], weights: Weights) -> Float[np.ndarray, " b"]:

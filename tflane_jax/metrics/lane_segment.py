@@ -13,10 +13,10 @@ from dataclasses import replace
 from typing import Any, Literal, Self, TypeVar
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from tflane_jax.errors import UserError
-from tflane_jax.metrics.bootstrap import Weights, bootstrap_precisions, frame_numbers
+from tflane_jax.metrics.bootstrap import Weights, bootstrap_precisions, frame_numbers, kept_in_sample
 from tflane_jax.metrics.centerline_matching import LANE_THRESHOLDS
 from tflane_jax.metrics.frames import one_of
 from tflane_jax.metrics.groups import Scope
@@ -36,6 +36,7 @@ from tflane_jax.metrics.segment_matching import (
 Flavour = Literal["OpenLane-V2", "LaneSegNet"]
 T = TypeVar("T")
 _CATEGORIES = {"crossing": CROSSING, "boundary": BOUNDARY}
+_SHORT = {"crossing": "ped", "boundary": "boundary"}
 
 
 class LaneSegmentMetrics:
@@ -102,17 +103,34 @@ class LaneSegmentMetrics:
         - "LaneSegNet": `AP_ls` and `AP_ls@1.0` ..., `AP_ped`, `AP_boundary`, `mAP` (of the first two), `TOP_lsls`, and
           `recall` and `AP_l` as `CenterlineMetrics.compute`.
 
-        Some of the segments (`scope` "lanes") have no areas, and therefore none of the numbers that rest on areas.
+        Of the whole test set (`scope` "all"), a category without true areas counts, as officially: 1 without detections
+        of it, else 0. Some of the frames, which may lack a category, have no number of one without true areas, and
+        `mAP` and `DET_a` are means over the others; `DET_a` and `OLUS` are missing without any. Some of the segments
+        (`scope` "lanes") have no areas, and therefore none of the numbers that rest on areas.
         """
-        lanes = self._lanes.compute()
+        truths = self._true_areas.sum(0)
+        return self._numbers(self._lanes.compute(), np.ones(len(truths), bool) if scope == "all" else truths > 0, scope)
+
+    def compute_sample(self, whole: Self) -> dict[str, float]:
+        """Return the metrics of frames that were drawn from a whole test set; `compute` has the names.
+
+        A category of areas that the test set has and the sample lacks is left out, as an attribute of traffic elements
+        is: 0, as officially where there are detections of it, would be the luck of the draw.
+        """
+        counted = kept_in_sample(self._true_areas.sum(0), whole._true_areas.sum(0))
+        return self._numbers(self._lanes.compute_sample(whole._lanes), counted, "all")
+
+    def _numbers(self, lanes: dict[str, float], counted: Bool[np.ndarray, "3"], scope: Scope) -> dict[str, float]:
+        """Return the metrics, given those of segments, and which categories of areas count."""
         scores, categories, hits = pooled(self._area_detections, (0,), (len(AREA_THRESHOLDS), 0))
         truths = self._true_areas.sum(0)
         areas = {
             name: [average_precision_11(scores[own], row[own], int(truths[category])) for row in hits]
             for name, category in _CATEGORIES.items()
+            if counted[category]
             for own in [categories == category]
         }
-        derived = {name: float(value) for name, value in self._derived(lanes, areas).items()}
+        derived = {name: float(value) for name, value in self._derived(lanes, areas, counted).items()}
         at_threshold = {
             f"{name}@{threshold}": value
             for name, values in areas.items()
@@ -132,16 +150,22 @@ class LaneSegmentMetrics:
         return {"TOP_lsls": lanes["TOP_ll"]} if self.flavour == "LaneSegNet" else lanes
 
     def bootstrap(self, weights: Weights, scope: Scope = "all") -> dict[str, Float[np.ndarray, " b"]]:
-        """Return AP, mAP, DET, TOP and OLUS of samples that count the frames as often as `weights` says."""
+        """Return AP, mAP, DET, TOP and OLUS of samples that count the frames as often as `weights` says.
+
+        Categories of areas are those of `compute`. The AP of one that a sample lacks is 0, and does not count in its
+        `mAP` or `DET_a`.
+        """
         lanes = self._lanes.bootstrap(weights)
         scores, categories, hits = pooled(self._area_detections, (0,), (len(AREA_THRESHOLDS), 0))
         frame, truths = frame_numbers(self._area_detections), self._true_areas
+        whole = truths.sum(0)
         areas = {
             name: list(bootstrap_precisions(scores[own], hits[:, own], frame[own], truths[:, category], weights)[0].T)
             for name, category in _CATEGORIES.items()
+            if scope == "all" or whole[category]
             for own in [categories == category]
         }
-        derived = self._derived(lanes, areas)
+        derived = self._derived(lanes, areas, kept_in_sample(weights @ truths, whole).T)
         if self.flavour == "LaneSegNet":
             lanes = {"AP_l": lanes["AP_l"]}
         lanes.pop("OLS", None)
@@ -152,18 +176,26 @@ class LaneSegmentMetrics:
         """True areas of every frame by category."""
         return by_frame(self._frame_areas, (BOUNDARY + 1,), int)
 
-    def _derived(self, lanes: Mapping[str, Any], areas: Mapping[str, Sequence[Any]]) -> dict[str, Any]:
+    def _derived(
+        self, lanes: Mapping[str, Any], areas: Mapping[str, Sequence[Any]], counted: Bool[np.ndarray, "3 *b"]
+    ) -> dict[str, Any]:
         """Return the scores that the flavour makes of numbers, or of arrays of samples.
 
         Args:
             lanes: scores of segments, named as those of centerlines.
-            areas: of each category, the average precision at every threshold.
+            areas: of each measured category, the average precision at every threshold.
+            counted: which categories count (in each sample), of those that are measured.
         """
+        precision = {name: np.mean(values, axis=0) for name, values in areas.items()}
+        weight = {name: counted[_CATEGORIES[name]].astype(float) for name in areas}
         if self.flavour == "LaneSegNet":
-            ap_ls, ap_ped = lanes["DET_l"], np.mean(areas["crossing"], axis=0)
-            means = {"AP_ls": ap_ls, "AP_ped": ap_ped, "AP_boundary": np.mean(areas["boundary"], axis=0)}
-            return means | {"mAP": (ap_ls + ap_ped) / 2, "TOP_lsls": lanes["TOP_ll"]}
-        det_a = np.mean([*areas["crossing"], *areas["boundary"]], axis=0)
+            ap_ls, crossing = lanes["DET_l"], weight.get("crossing", 0.0)
+            mean = (ap_ls + crossing * precision.get("crossing", 0.0)) / (1.0 + crossing)
+            means = {f"AP_{_SHORT[name]}": value for name, value in precision.items()}
+            return {"AP_ls": ap_ls} | means | {"mAP": mean, "TOP_lsls": lanes["TOP_ll"]}
+        if not areas:
+            return {}
+        det_a = sum(weight[name] * precision[name] for name in areas) / np.maximum(sum(weight.values()), 1.0)
         if "DET_t" not in lanes:
             return {"DET_a": det_a}
         topology = [lanes["TOP_ll"], lanes["TOP_lt"]]

@@ -13,11 +13,17 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Self
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from tflane_jax.errors import UserError
 from tflane_jax.files.openlane import ATTRIBUTES
-from tflane_jax.metrics.bootstrap import Weights, bootstrap_mean, bootstrap_precisions, frame_numbers
+from tflane_jax.metrics.bootstrap import (
+    Weights,
+    bootstrap_mean,
+    bootstrap_precisions,
+    frame_numbers,
+    kept_in_sample,
+)
 from tflane_jax.metrics.centerline_matching import LANE_THRESHOLDS, MatchedFrame, match_frame
 from tflane_jax.metrics.frames import LaneDetections, LaneTruth
 from tflane_jax.metrics.groups import Scope
@@ -100,6 +106,18 @@ class CenterlineMetrics:
           `DET_t@12`; `TOP_lt` (missing like `TOP_ll`); `OLS`, missing if one of its parts is;
         - `TOP_ll`, `TOP_lt` and `OLS` of the further versions, named with the version: `TOP_ll_v1.0`.
         """
+        return self._numbers(np.ones(ATTRIBUTES, bool))
+
+    def compute_sample(self, whole: Self) -> dict[str, float]:
+        """Return the metrics of frames that were drawn from a whole test set; `compute` has the names.
+
+        An attribute that the test set has and the sample lacks is left out of `DET_t`: 0, as officially where there are
+        detections of it, would be the luck of the draw.
+        """
+        return self._numbers(kept_in_sample(self._truths.sum(0)[2:], whole._truths.sum(0)[2:]))
+
+    def _numbers(self, counted: Bool[np.ndarray, " a"]) -> dict[str, float]:
+        """Return the metrics, with those attributes of traffic elements that count."""
         truths = self._truths.sum(0)
         lanes = int(truths[0])
         result: dict[str, float] = {"frames": len(self._frame_truths), "lanes": lanes}
@@ -120,12 +138,12 @@ class CenterlineMetrics:
             return result
 
         scores, hits, attributes = pooled(self._element_detections, (0,), (0,))
-        precisions = [
-            average_precision_11(scores[attributes == i], hits[attributes == i], int(count))
-            for i, count in enumerate(truths[2:])
-        ]
-        result["DET_t"] = float(np.mean(precisions))
-        result |= {f"DET_t@{i}": value for i, value in enumerate(precisions)}
+        precision = {
+            i: average_precision_11(scores[attributes == i], hits[attributes == i], int(truths[2 + i]))
+            for i in np.flatnonzero(counted).tolist()
+        }
+        result["DET_t"] = float(np.mean(list(precision.values()))) if precision else 0.0
+        result |= {f"DET_t@{i}": value for i, value in precision.items()}
         result |= topology
         return result | {name: float(value) for name, value in self._overall(result).items()}
 
@@ -137,7 +155,10 @@ class CenterlineMetrics:
         }
 
     def bootstrap(self, weights: Weights, scope: Scope = "all") -> dict[str, Float[np.ndarray, " b"]]:
-        """Return DET, AP_l, TOP and OLS of samples that count the frames as often as `weights` says."""
+        """Return DET, AP_l, TOP and OLS of samples that count the frames as often as `weights` says.
+
+        Attributes count in `DET_t` as in `compute_sample`.
+        """
         truths = self._truths
         scores, hits = pooled(self._lane_detections, (len(LANE_THRESHOLDS), 0))
         frame = frame_numbers(self._lane_detections)
@@ -152,7 +173,9 @@ class CenterlineMetrics:
             own = attributes == i
             eleven, _ = bootstrap_precisions(scores[own], hits[None, own], frame[own], truths[:, 2 + i], weights)
             precisions.append(eleven[:, 0])
-        result["DET_t"] = np.mean(precisions, axis=0)
+        elements = truths[:, 2:]
+        counted = kept_in_sample(weights @ elements, elements.sum(0))
+        result["DET_t"] = (np.stack(precisions, -1) * counted).sum(-1) / np.maximum(counted.sum(-1), 1)
         return result | self._overall(result)
 
     @property

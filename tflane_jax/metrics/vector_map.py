@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from tflane_jax.errors import UserError
-from tflane_jax.metrics.bootstrap import Weights, bootstrap_precisions, frame_numbers
+from tflane_jax.metrics.bootstrap import Weights, bootstrap_precisions, frame_numbers, kept_in_sample
 from tflane_jax.metrics.frames import one_of
 from tflane_jax.metrics.groups import Scope
 from tflane_jax.metrics.map_matching import (
@@ -177,7 +177,7 @@ def counted_in_sample(
     truths: Int[np.ndarray, "c *b"], whole: Int[np.ndarray, "c *#b"], scope: Scope
 ) -> Bool[np.ndarray, "c *b"]:
     """Return which classes of `_counted` count in a sample: not those of the whole test set that the sample lacks."""
-    return _counted(truths, scope) & ((truths > 0) | (whole == 0))
+    return _counted(truths, scope) & kept_in_sample(truths, whole)
 
 
 def mean_precision(

@@ -19,6 +19,7 @@ import numpy as np
 
 from tflane_jax.errors import UserError
 from tflane_jax.files.fields import choices, fractions, items, load_file, member, scores
+from tflane_jax.files.folders import named_folder
 from tflane_jax.files.openlane import (
     CENTERLINE,
     DENSE_POINTS,
@@ -74,7 +75,7 @@ def read_truth(path: Path, *, predicted: Collection[FrameKey] = (), progress: bo
 
 def read_segment_predictions(path: Path) -> dict[FrameKey, SegmentDetections]:
     """Return the detections of a lane-segment submission; raises UserError that names file, frame and field."""
-    return _submission(path, _segment_detections)
+    return _all_or_none(_submission(path, _segment_detections), path)
 
 
 def read_segment_truth(
@@ -87,7 +88,7 @@ def read_segment_truth(
     each.
     """
     parse = partial(_segment_truth, flavour=flavour)
-    return _annotations(path, SEGMENT, parse, predicted, progress)
+    return _all_or_none(_annotations(path, SEGMENT, parse, predicted, progress), path)
 
 
 T = TypeVar("T")
@@ -107,7 +108,7 @@ def _annotations(
     """Return annotations; `parse` takes a record, the words that name it, and whether it is the dataset's own."""
     if os.path.isdir(path):
         files = progress_bar(
-            annotation_files(path.resolve(), names, predicted, path).items(),
+            annotation_files(named_folder(path), names, predicted, path).items(),
             desc=f"read {path.name}",
             unit="frame",
             disable=not progress,
@@ -208,6 +209,23 @@ def _types(record: Any, where: str) -> list[np.ndarray | None]:
         else None
         for field in (f"{side}_laneline_type" for side in _SIDES)
     ]
+
+
+Segments = TypeVar("Segments", SegmentDetections, SegmentTruth)
+
+
+def _all_or_none(frames: dict[FrameKey, Segments], path: Path) -> dict[FrameKey, Segments]:
+    """Return the frames; raise UserError if some have types of lines and others none: a part would be scored."""
+    some = {key: frame for key, frame in frames.items() if len(frame.left)}
+    for side in ("left", "right"):
+        have = {key: getattr(frame, f"{side}_type") is not None for key, frame in some.items()}
+        if any(have.values()) and not all(have.values()):
+            lacks = next(key for key, has in have.items() if not has)
+            raise UserError(
+                f"{path}, frame {named(lacks)}: its segments have no {side}_laneline_type, which those of other frames "
+                "have: add it to all, or take it out"
+            )
+    return frames
 
 
 def _visibility(record: Any, things: str, where: str) -> np.ndarray | None:

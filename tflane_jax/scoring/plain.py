@@ -6,8 +6,8 @@ metres, ego frame, in driving direction; `successor` (F, L, L), [f, i, j] lane j
 `tflane predict` writes both sides. Its predictions of lane segments have `category` (F, L), 0 lane segment, 1 crossing:
 crossings are no lanes and are left out.
 
-.json: {"frames": [{"scene", "timestamp_ns", "points", "successor", "scores" or "visibility"}]}, the same by frame,
-where lines may have different numbers of points.
+.json: {"frames": [{"scene", "timestamp_ns", "points", "successor", "scores" or "visibility"}]}, the same by frame, also
+`valid` and `category`; lines may have different numbers of points.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def read_truth(path: Path) -> dict[PlainKey, LaneTruth]:
 
 
 def _frames(path: Path) -> Iterator[tuple[PlainKey, Any, str]]:
-    records = _npz_records(path) if path.suffix == ".npz" else items(load_file(path), "frames", str(path))
+    records = _npz_records(path) if path.suffix == ".npz" else _json_records(path)
     seen = set()
     for i, record in enumerate(records):
         at = f"{path}: frames[{i}]"
@@ -110,6 +110,27 @@ def _npz_records(path: Path) -> Iterator[dict[str, Any]]:
         yield record
 
 
+def _json_records(path: Path) -> Iterator[Any]:
+    """Return the frames of a file of records, without empty slots and crossings."""
+    for i, record in enumerate(items(load_file(path), "frames", str(path))):
+        at = f"{path}: frames[{i}]"
+        given = record.keys() & {"valid", "category"} if isinstance(record, dict) else ()
+        if not given:
+            yield record
+            continue
+        count = len(items(record, "points", at))
+        kept = choices(record.get("valid", np.ones(count, bool)), (count,), f"{at}: valid")
+        if "category" in given:
+            kept &= ~choices(record["category"], (count,), f"{at}: category")
+        rows = np.flatnonzero(kept).tolist()
+        lists = record.keys() & {"points", "scores", "visibility"}
+        found = record | {name: [items(record, name, at)[row] for row in rows] for name in lists}
+        if "successor" in record:
+            edges = fractions(record["successor"], (count, count), f"{at}: successor", largest=np.inf)
+            found["successor"] = edges[np.ix_(rows, rows)]
+        yield found
+
+
 def _lines(record: Any, where: str, least: int = 1) -> list[np.ndarray]:
     """Return the lines, each of at least so many points."""
     lines = enumerate(items(record, "points", where))
@@ -118,7 +139,7 @@ def _lines(record: Any, where: str, least: int = 1) -> list[np.ndarray]:
 
 def _successor(record: Any, where: str) -> np.ndarray:
     lanes = len(items(record, "points", where))
-    return fractions(member(record, "successor", where), (lanes, lanes), f"{where}: successor")
+    return fractions(member(record, "successor", where), (lanes, lanes), f"{where}: successor", largest=np.inf)
 
 
 def _column(record: Any, name: str, where: str) -> np.ndarray:

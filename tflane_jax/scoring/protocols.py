@@ -124,6 +124,7 @@ def _lane_segment(flavour: Flavour, columns: tuple[str, ...]) -> ScoringProtocol
         metrics=metrics,
         columns=(*columns, "AE_type", "AE_dist"),
         formats=("OpenLane-V2 lane segments",),
+        of_scene=lambda metrics: metrics.compute("frames"),
         remarks=remarks.segments,
         found=columns[1],
         groups=_groups(metrics),

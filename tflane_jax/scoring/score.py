@@ -137,6 +137,11 @@ def check_bootstrap(scenes: int) -> None:
 def _check_frames(predictions: Mapping[Hashable, Any], truth: Mapping[Hashable, Any]) -> None:
     if not truth:
         raise UserError("the ground truth has no frames")
+    if len({type(key) for key in (*predictions, *truth)}) > 1 and not predictions.keys() & truth.keys():
+        raise UserError(
+            "predictions and ground truth name their frames in different forms: give both as OpenLane-V2's files, or "
+            "both in the plain form"
+        )
     problems = []
     for what, remedy, ours, other in (
         (

@@ -294,7 +294,7 @@ def _arrays():
             ("times are NaN", {"timestamp_ns": np.full(3, np.nan)}, "timestamp_ns is .*nan.*, expected whole"),
             ("scenes are bytes", {"scene": np.array([b"a", b"a", b"b"])}, "scene is .*, expected a text"),
             ("scenes are fractions", {"scene": np.arange(3) + 0.5}, "scene is .*0.5.*, expected a text"),
-            ("successor above 1", {"successor": np.full((3, 2, 2), 1.5)}, "frame a at 1 ns: successor.*1.5"),
+            ("negative successor", {"successor": np.full((3, 2, 2), -0.5)}, "frame a at 1 ns: successor.*-0.5"),
             ("successor NaN", {"successor": np.full((3, 2, 2), np.nan)}, "successor holds nan"),
             ("successor complex", {"successor": np.zeros((3, 2, 2), complex)}, "successor .*complex"),
             (

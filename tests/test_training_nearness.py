@@ -18,7 +18,7 @@ from tflane_jax.training_nearness import training_nearness
 
 def test_test_frames_are_compared_with_the_places_of_the_training_split(tmp_path):
     np.savez(tmp_path / "scene-0061.npz", **content())
-    np.savez(tmp_path / "scene-0099.npz", **content())
+    np.savez(tmp_path / "scene-0099.npz", **content("scene-0099"))
     recorded, maps = RecordedData(tmp_path, test=("scene-0099",)), RealMapData(tmp_path, test_logs=("scene-0099",))
     test = recorded.source("test")
     for data in (recorded, maps):

@@ -53,7 +53,7 @@ def folder(tmp_path_factory):
     root = tmp_path_factory.mktemp("carry_over")
     (root / "maps").mkdir()
     for name in ("scene-1", "scene-2", "scene-3"):
-        np.savez(root / "maps" / f"{name}.npz", **content())
+        np.savez(root / "maps" / f"{name}.npz", **content(name))
     tiny = root / "tiny.py"
     tiny.write_text(TINY + ON_MAPS)
     rows = {"generated": f"{tiny}:generated", "mixed": f"{tiny}:mixed", "mixed without traffic": f"{tiny}:plain"}
@@ -222,7 +222,7 @@ def test_other_files_of_the_maps_are_other_runs(folder):
     assert sorted(declared["content"]) == ["scene-1", "scene-2", "scene-3"]
     path = folder / "maps" / "scene-2.npz"
     kept = path.read_bytes()
-    np.savez(path, **content(), more=np.zeros(1))
+    np.savez(path, **content("scene-2"), more=np.zeros(1))
     try:
         with pytest.raises(UserError, match=r"another declaration \(content of scene-2: \w+ there, \w+ here\)"):
             carry_over(settings(folder), folder / "out")
@@ -236,7 +236,7 @@ def test_other_files_of_the_maps_are_other_runs(folder):
 
 
 def test_a_single_log_cannot_be_left_out(tmp_path, capsys):
-    np.savez(tmp_path / "scene-1.npz", **content())
+    np.savez(tmp_path / "scene-1.npz", **content("scene-1"))
     assert main(["carry-over", str(tmp_path), "--out", str(tmp_path / "out")]) == 2
     assert "there must be two or more" in capsys.readouterr().err
     assert main(["carry-over", str(tmp_path), "--seeds", "0"]) == 2

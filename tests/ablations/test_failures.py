@@ -146,7 +146,7 @@ def test_without_a_control_there_is_a_table_and_no_test(tiny, tmp_path, monkeypa
 
 def test_paired_tests_name_the_seeds_of_each_checkpoint(tmp_path, capsys):
     """A run has no best checkpoint where no evaluation gave a finite score."""
-    results = Results(("base", "tfm"), (0, 1, 2), {}, "a protocol")
+    results = Results(("base", "tfm"), (0, 1, 2), {})
     for model in results.models:
         for seed in results.seeds:
             measured = Measured(4, "a protocol", {"": {"all/recall": 0.1 * seed + len(model)}}, {"": {}})
@@ -162,7 +162,7 @@ def test_paired_tests_name_the_seeds_of_each_checkpoint(tmp_path, capsys):
 
 def test_the_scores_name_their_seeds(tmp_path, capsys):
     """Regression: scores.json had lists alone, so nobody could tell which run a number of an incomplete row is from."""
-    results = Results(("base", "tfm"), (3, 1, 7), {}, "a protocol")
+    results = Results(("base", "tfm"), (3, 1, 7), {})
     for model, seed in (("base", 7), ("base", 1), ("tfm", 3)):
         results.add("", "last", model, seed, Measured(4, "a protocol", {"": {"all/recall": seed / 10}}, {"": {}}))
     save_report(results, RunConfig().task, {}, tmp_path)
@@ -174,7 +174,7 @@ def test_the_scores_name_their_seeds(tmp_path, capsys):
 
 def test_a_row_that_lacks_seeds_takes_none_from_another_row(tmp_path, capsys):
     """Regression: paired tests took the seeds that all rows have, so one failed row left the others without any."""
-    results = Results(("base", "tfm", "poor", "none"), (0, 1, 2), {}, "a protocol")
+    results = Results(("base", "tfm", "poor", "none"), (0, 1, 2), {})
     has = {"base": (0, 1, 2), "tfm": (0, 1, 2), "poor": (1,)}
     for model, seeds in has.items():
         for seed in seeds:

@@ -9,7 +9,9 @@ from tests.ablations.effect_cases import CONTROL, DECLARED, PRIMARY, SEEDS, made
 from tflane_jax.ablations.declaration import Claim, Declaration, Declared
 from tflane_jax.ablations.effects import DIFFERENCE, Effect, effects, judged_claims
 from tflane_jax.ablations.findings import findings, save_effects, sentence
+from tflane_jax.ablations.report import save_report
 from tflane_jax.ablations.results import Results
+from tflane_jax.config import RunConfig
 from tflane_jax.datasets.tusimple import SOURCE as TUSIMPLE
 
 
@@ -75,7 +77,7 @@ def test_the_page_names_claims_without_a_result(results, tmp_path):
 
 
 def test_where_every_row_but_one_failed_all_comparisons_are_named(tmp_path):
-    found = Results(("baseline", "+TFM", "matched"), SEEDS, {}, "p", failed={"+TFM": "out of memory"})
+    found = Results(("baseline", "+TFM", "matched"), SEEDS, {}, failed={"+TFM": "out of memory"})
     found.add("", "last", "baseline", 0, measured(0, own=(0.3, 0.3)))
     said = findings(judged_claims(found, DECLARED, ""))
     assert said[0].startswith("**not tested** (no run of +TFM was measured (out of memory)): +TFM is better than *bas")
@@ -98,6 +100,11 @@ def test_models_that_are_measured_by_several_protocols_are_named(results, tmp_pa
     tested = judged_claims(results, declared, "")
     path = save_effects(results, Declared(declared, SEEDS, "now", 0), "", tested, tmp_path / "effects")
     assert "**Different protocols** (flat by" in path.read_text()
+    for written in save_report(results, RunConfig().task, {}, tmp_path):  # tables and paired tests, undeclared ones too
+        if written.suffix == ".md":
+            title, _, warning = written.read_text().splitlines()[:3]
+            assert title.startswith("a protocol / with heights, test split")
+            assert warning.startswith("**Different protocols** (flat by")
 
 
 def test_runs_without_a_best_checkpoint_are_no_interim_look(tmp_path):

@@ -3,8 +3,11 @@
 import json
 import shutil
 
+import pytest
+
 from tests.shared import ROOT
-from tflane_jax.ablations.published import page
+from tflane_jax.ablations import published
+from tflane_jax.ablations.published import page, record
 from tflane_jax.cli import main
 
 
@@ -81,6 +84,38 @@ def test_no_page_is_made_of_a_folder_without_results(tmp_path, capsys):
     assert main(["tables", "--record", str(tmp_path / "empty")]) == 2
     assert "empty holds no results of tables" in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["empty"]
+
+
+@pytest.mark.parametrize("content", ["[]", '{"meta": {}}', '{"table": "x", "rows": [], "quoted": {}}'])
+def test_another_json_file_is_named_before_anything_is_trained(tmp_path, capsys, content):
+    """Regression: a traceback, after the trainings."""
+    (tmp_path / "sweep.json").write_text(content)
+    for command in (["tables"], ["tables", "markers.3", "--out", str(tmp_path / "out")]):
+        assert main([*command, "--record", str(tmp_path)]) == 2
+        assert "sweep.json" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["sweep.json"]
+
+
+def test_without_matplotlib_the_page_has_no_pictures_beside_it(tmp_path, monkeypatch):
+    folder = tmp_path / "results"
+    folder.mkdir()
+    shutil.copy(ROOT / "docs" / "results" / "markers.3.json", folder)
+    with monkeypatch.context() as patch:
+        patch.setattr(published.importlib.util, "find_spec", lambda name: None)
+        record([], folder)
+    assert (tmp_path / "results.md").read_text() == page(folder)
+    assert [path.name for path in folder.iterdir()] == ["markers.3.json"]
+    record([], folder)
+    assert sorted(path.name for path in folder.iterdir()) == ["markers.3.json", "markers.png"]
+
+
+def test_claims_of_an_interim_table_are_marked():
+    text = page(ROOT / "docs" / "results")
+    summary = text[text.index("## All claims") : text.index("## tf_lane.1:")]
+    for name, seeds in (("markers.5", "4 of 8"), ("gtn_lane.1", "1 to 2 of 5"), ("markers.1", "")):
+        marked = [line for line in summary.splitlines() if line.startswith(f"| [{name}](")]
+        assert marked
+        assert all((f", interim: {seeds} seeds |" in " ".join(line.split())) == bool(seeds) for line in marked)
 
 
 def test_the_page_is_written_anew_without_a_table(tmp_path, capsys):

@@ -37,6 +37,8 @@ def test_settings_that_cannot_be_swept_are_refused(folder, tmp_path, monkeypatch
         sweep(other, "data.world.severity", ["0"], tmp_path, ["--training.batch_size", "3"])
     with pytest.raises(UserError, match=r"data\.example\.range"):  # numbers would come out all the same
         sweep(other, "data.world.severity", ["0"], tmp_path, ["--data.example.range.x", "-60", "60"])
+    with pytest.raises(UserError, match="--values has 0 twice: once is enough"):
+        sweep(other, "data.world.severity", ["0", "0", "1"], tmp_path)
     with pytest.raises(UserError, match="give a setting of the data"):
         sweep({"other": folder}, "optim.lr", ["1"], tmp_path)
     with pytest.raises(UserError, match="is no run folder, and holds none"):

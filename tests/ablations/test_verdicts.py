@@ -57,6 +57,20 @@ def test_numbers_are_those_of_the_primary_measure(second):
     assert only_row(text) == only_row(sentence([EFFECT]))
 
 
+@pytest.mark.parametrize(
+    ("claim", "paper"),
+    [
+        ("A helps (+7.7 DET_l)", "+7.7 DET_l"),
+        ("A helps (+0.19 DET_l, +1.17 OLS)", "+0.19 DET_l, +1.17 OLS"),
+        ("the text: it helps; the table: -0.89 mAP with LT/LL", "-0.89 mAP"),
+        ("ours: cells within 4 m help", None),
+        ("", None),
+    ],
+)
+def test_what_the_paper_reports_is_what_the_claim_quotes(claim, paper):
+    assert only_row(sentence([replace(EFFECT, claim=Claim("A", "B", claim))]))["the paper"] == paper
+
+
 def test_one_seed_has_no_p():
     one = replace(EFFECT, seeds=(0,), finding="not tested", p=float("nan"), p_holm=float("nan"))
     row = only_row(sentence([one]))

@@ -21,7 +21,7 @@ from tflane_jax.scene import LineType, RoadUser
 SCENES = ("0061", "0655", "0757", "0796", "1077", "1094", "1100")
 
 
-def content():
+def content(name="scene-0061"):
     """A vehicle that stands at (10, 20), heading north; a lane under it, a connector after it, a cone and a car."""
     lines = [
         [(10, 0), (10, 20), (10, 20), (10, 40)],  # the joint of two arcs is there twice
@@ -56,7 +56,7 @@ def content():
         "polyline_len": np.array([len(line) for line in lines]),
         "polygon": np.array([point for ring in outlines for point in ring], float),
         "polygon_len": np.array([len(ring) for ring in outlines]),
-        "meta": np.array(json.dumps({"scene": "scene-0061", "rate_hz": 2})),
+        "meta": np.array(json.dumps({"scene": name, "rate_hz": 2})),
     }
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
@@ -24,7 +25,7 @@ from tflane_jax.ablations.finished_runs import (
 )
 from tflane_jax.ablations.jobs import Tests, check_rows, plan_jobs
 from tflane_jax.ablations.report import save_report, suffixes
-from tflane_jax.ablations.results import Results
+from tflane_jax.ablations.results import OWN_SPLIT, Results
 from tflane_jax.ablations.scores import OWN_TEST, with_test_set
 from tflane_jax.ablations.workers import worker_threads
 from tflane_jax.config import RunConfig
@@ -89,7 +90,6 @@ def compare(
     first, models = next(iter(configs.values())), first_models(trained, results)
     remarks = {name: model.task.remarks(model.params) for name, model in models.items()}
     pair = list(configs)[:2] if declaration is None else [next(iter(configs)), declaration.claims[0].treatment]
-    written += draw_models(first, models, pair, out / "comparison.png")
     with contextlib.nullcontext() if summary is None else contextlib.redirect_stdout(io.StringIO()):
         tables = save_report(results, first.task, remarks, out)
         if declared is not None:
@@ -98,6 +98,10 @@ def compare(
                 source = source_of(with_test_set(first, tests.get(test, ())).data.source("test"))
                 stem = out / f"effects{suffix}"
                 tables.append(save_effects(results, declared, test, tested, stem, no_drives=source.no_drives))
+        try:
+            written += draw_models(first, models, pair, out / "comparison.png")
+        except UserError as error:  # the tables stand without it
+            print(f"tflane: no picture of the models: {error}", file=sys.stderr)
         print("\nwritten:", *tables, *written, sep="\n  ")
     if failures:
         raise UserError(summary_of(failures, len(every)))
@@ -109,6 +113,10 @@ def compare(
 def _check_tests(configs: Mapping[str, RunConfig], tests: Tests) -> None:
     if OWN_TEST in tests:
         raise UserError("a test set needs a name")
+    if OWN_SPLIT in tests:
+        raise UserError(
+            f"a test set cannot be named {OWN_SPLIT}: so comparison.json names the configurations' own split"
+        )
     own = next(iter(configs.values())).data.source("test")
     for name, settings in ({OWN_TEST: ()} | dict(tests)).items():
         sources = [with_test_set(config, settings).data.source("test") for config in configs.values()]

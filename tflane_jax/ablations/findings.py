@@ -28,7 +28,7 @@ def save_effects(
 
     `no_drives` is that of the test data, see `DataSource`.
     """
-    lines = [f"{results.protocol}, {results.title(test)}", "", declared.sentence()]
+    lines = [f"{results.protocol(test)}, {results.title(test)}", "", declared.sentence()]
     seeds = min((effect.seeds for effect in tested.effects if effect.checkpoint == "last"), key=len, default=())
     if seeds and set(seeds) != set(declared.seeds):
         lines.append(f"**Interim**: {len(seeds)} of {len(declared.seeds)} declared seeds ({listed(seeds)}).")
@@ -48,7 +48,7 @@ def save_effects(
             lines.append(f"Remark: {no_drives}: the intervals are too narrow.")
     rows, title = _rows(results, declared.declaration, test, tested), "\n".join(lines)
     print("\n" + format_table(rows, title=title, digits=4))
-    meta = {"declaration": asdict(declared), "protocol": results.protocol, "seeds": list(seeds)}
+    meta = {"declaration": asdict(declared), "protocol": results.protocol(test), "seeds": list(seeds)}
     return save_table(stem, rows, meta, title=title, digits=4)[0]
 
 

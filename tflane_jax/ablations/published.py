@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import re
 import textwrap
@@ -23,7 +24,8 @@ from tflane_jax.plots.tables import counted, format_table
 _WIDTH = 120
 _CLAIMS = (
     "The difference is treatment minus control in the table's primary measure; p is corrected for the claims of the "
-    "table. Intervals over scenes, negative controls and secondary measures stand with the tables below. The paper's "
+    "table. Negative controls and secondary measures stand with the tables below. Of an interim table, more seeds may "
+    "change a verdict. The paper's "
     "difference is that of its own data, in the measure that stands beside it."
 )
 
@@ -56,21 +58,24 @@ def record(summaries: Sequence[Path], folder: Path) -> Path:
             )
             continue
         write_text(there, json.dumps(content, indent=1) + "\n")
-    draw_claims(folder)
-    return write_text(folder.with_name(f"{folder.name}.md"), page(folder))
+    written = write_text(folder.with_name(f"{folder.name}.md"), page(folder))
+    if importlib.util.find_spec("matplotlib") is not None:
+        draw_claims(folder)
+    return written
 
 
 def draw_claims(folder: Path) -> None:
     """Draw the claims of a folder of summaries: a picture for each group of tables, such as `markers.png`."""
-    found = _summaries(folder)
+    found = summaries(folder)
     for group, names in _groups(found).items():
         if claims := verdicts({name: found[name] for name in names}):
-            save_claims(folder / f"{group}.png", claims, {name: _heading(found[name]) for name in names})
+            headings = {name: (_heading(found[name]), _if_interim(found[name])) for name in names}
+            save_claims(folder / f"{group}.png", claims, headings)
 
 
 def page(folder: Path) -> str:
     """Return the page of a folder of summaries, in the order of the tables."""
-    found = _summaries(folder)
+    found = summaries(folder)
     lines = [
         "# Results",
         "",
@@ -84,7 +89,8 @@ def page(folder: Path) -> str:
         "same.",
     ]
     names = list(found)
-    if claims := verdicts({f"[{name}](#{_anchor(found[name])})": found[name] for name in names}):
+    linked = {f"[{name}](#{_anchor(found[name])}){_if_interim(found[name])}": found[name] for name in names}
+    if claims := verdicts(linked):
         lines += ["", "## All claims", "", *_wrapped(_CLAIMS), "", format_table(claims)]
         for group in _groups(name for name in names if found[name]["findings"]):
             lines += ["", f"![Claims of {group}]({folder.name}/{group}.png)"]
@@ -103,9 +109,12 @@ def page(folder: Path) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _summaries(folder: Path) -> dict[str, Mapping[str, Any]]:
-    """Return the summaries of a folder by name, in the order of the tables."""
+def summaries(folder: Path) -> dict[str, Mapping[str, Any]]:
+    """Return the summaries of a folder by name, in the order of the tables; raise UserError for another JSON file."""
     found = {path.stem: load_json(path) for path in folder.glob("*.json")}
+    for name, summary in found.items():
+        for field in ("table", "findings", "rows", "quoted"):
+            member(summary, field, str(folder / f"{name}.json"))
     return {name: found[name] for name in (*TABLES, *sorted(found.keys() - TABLES.keys())) if name in found}
 
 
@@ -199,10 +208,20 @@ def _seeds_option(summary: Mapping[str, Any]) -> str:
 
 def _interim(summary: Mapping[str, Any]) -> str:
     """Return a sentence for a table of which a row has fewer seeds than it declares; "" for one with all."""
+    return f" **Interim**: {lacking} declared seeds." if (lacking := _lacking(summary)) else ""
+
+
+def _if_interim(summary: Mapping[str, Any]) -> str:
+    """Return the same as a remark behind the name of a table."""
+    return f", interim: {lacking} seeds" if (lacking := _lacking(summary)) else ""
+
+
+def _lacking(summary: Mapping[str, Any]) -> str:
+    """Return how many seeds the rows have, "2 of 5", where one has fewer than the table declares; else ""."""
     (least, most), table = _fewest_and_most(summary), TABLES.get(summary["table"])
     declared = summary.get("declared seeds", most if table is None else table.seeds)  # earlier summaries have none
     count = str(most) if least == most else f"{least} to {most}"
-    return f" **Interim**: {count} of {declared} declared seeds." if least < declared else ""
+    return f"{count} of {declared}" if least < declared else ""
 
 
 def _fewest_and_most(summary: Mapping[str, Any]) -> tuple[int, int]:

@@ -56,7 +56,7 @@ def _save_table(
     remarks: Mapping[str, Mapping[str, str]],
     stem: Path,
 ) -> Path:
-    title = f"{results.protocol}, {results.title(test)}, {_count(results.seeds)}, percent (mean ± std)"
+    title = f"{results.protocol(test)}, {results.title(test)}, {_count(results.seeds)}, percent (mean ± std)"
     rows: list[dict[str, Any]] = []
     for which in CHECKPOINTS:
         for row, by_seed in results.rows(test, which).items():
@@ -69,9 +69,10 @@ def _save_table(
             rows.append(cells)
     if missing := [model for model in results.models if not results.has(model)]:
         title += f"; no run of {', '.join(missing)} is complete"
+    title = _with_warning(title, results, test)
     rows += task.quoted()
     print("\n" + format_table(rows, title=title))
-    meta = {"protocol": results.protocol, "seeds": list(results.seeds), "test": list(results.tests.get(test, ()))}
+    meta = {"protocol": results.protocol(test), "seeds": list(results.seeds), "test": list(results.tests.get(test, ()))}
     return save_table(stem, rows, meta, title=title)[0]
 
 
@@ -97,10 +98,16 @@ def _save_paired(results: Results, test: str, metrics: Sequence[str], task: Task
     if not rows:
         return []
     over = "the seeds that both have" if any("seeds" in row for row in rows) else _count(results.seeds)
-    title = f"{results.protocol}, {results.title(test)}: paired differences to {control}, two-sided t-test over {over}"
-    title += "; p (Holm) is corrected for all tests of one checkpoint"
+    title = f"{results.protocol(test)}, {results.title(test)}: paired differences to {control}, two-sided t-test "
+    title = _with_warning(f"{title}over {over}; p (Holm) is corrected for all tests of one checkpoint", results, test)
     print("\n" + format_table(rows, title=title, digits=4))
-    return [save_table(stem, rows, {"protocol": results.protocol, "seeds": seeds}, title=title, digits=4)[0]]
+    return [save_table(stem, rows, {"protocol": results.protocol(test), "seeds": seeds}, title=title, digits=4)[0]]
+
+
+def _with_warning(title: str, results: Results, test: str) -> str:
+    """Return the title of a table, with a sentence below if its rows are measured by several protocols."""
+    mixed = results.mixed_protocols(test)
+    return f"{title}\n\n{mixed}" if mixed else title
 
 
 def _count(seeds: Sequence[int]) -> str:

@@ -10,9 +10,12 @@ from tflane_jax.ablations.comparison import Scores
 from tflane_jax.ablations.declaration import model_of_row
 from tflane_jax.ablations.jobs import Tests
 from tflane_jax.ablations.recorded import Measured, Which
+from tflane_jax.ablations.scores import OWN_TEST
 from tflane_jax.errors import UserError
 from tflane_jax.evaluation.results import SceneRatio, SceneSamples
 
+OWN_SPLIT = "test"
+"""Name of the configurations' own test split among the scores of a comparison."""
 Ratios = Mapping[str, SceneRatio]
 Samples = Mapping[str, SceneSamples]
 
@@ -25,7 +28,6 @@ class Results:
         models: names, the control first.
         seeds: that were asked for.
         tests: further test sets, see `compare`.
-        protocol: of the metrics, with its version.
         scores: by (test set, checkpoint), by row of the table, by seed. Rows are models, or "model, intervention".
         ratios: parts of the scores that are ratios of sums over scenes, in the same order.
         samples: other scores in samples of the scenes, in the same order.
@@ -37,7 +39,6 @@ class Results:
     models: tuple[str, ...]
     seeds: tuple[int, ...]
     tests: Tests
-    protocol: str = ""
     scores: dict[tuple[str, Which], dict[str, dict[int, Scores]]] = field(default_factory=dict)
     ratios: dict[tuple[str, Which], dict[str, dict[int, Ratios]]] = field(default_factory=dict)
     samples: dict[tuple[str, Which], dict[str, dict[int, Samples]]] = field(default_factory=dict)
@@ -47,7 +48,7 @@ class Results:
 
     def add(self, test: str, which: Which, model: str, seed: int, measured: Measured) -> None:
         """Add what was measured of a run; raises UserError if it is not measured as the other runs of its row."""
-        self.protocol, first = measured.protocol, self.protocols.setdefault((test, model), measured.protocol)
+        first = self.protocols.setdefault((test, model), measured.protocol)
         if measured.protocol != first:
             raise UserError(f"seed {seed} of {model} is measured by {measured.protocol}, earlier ones by {first}")
         for way, scores in measured.ways.items():
@@ -57,16 +58,13 @@ class Results:
             self.ratios.setdefault((test, which), {}).setdefault(row, {})[seed] = measured.ratios[way]
             self.samples.setdefault((test, which), {}).setdefault(row, {})[seed] = measured.samples.get(way, {})
 
+    def protocol(self, test: str = OWN_TEST) -> str:
+        """Return name and version of the metrics of a test set; of all, where models are measured by several."""
+        return " / ".join(dict.fromkeys(protocol for (own, _), protocol in self.protocols.items() if own == test))
+
     def mixed_protocols(self, test: str) -> str:
         """Return a sentence for models that are measured by several protocols; "" if by one."""
-        of: dict[str, list[str]] = {}
-        for (own, model), protocol in self.protocols.items():
-            if own == test:
-                of.setdefault(protocol, []).append(model)
-        if len(of) < 2:
-            return ""
-        listed = "; ".join(f"{', '.join(models)} by {protocol}" for protocol, models in of.items())
-        return f"**Different protocols** ({listed}): where these differ, scores of one name are not comparable."
+        return mixed_protocols({model: protocol for (own, model), protocol in self.protocols.items() if own == test})
 
     def has(self, model: str) -> bool:
         """Return whether any run of a model was measured."""
@@ -86,9 +84,20 @@ class Results:
         """Return everything as JSON: by test set, checkpoint, row and seed."""
         content: dict[str, Any] = {}
         for (test, which), rows in self.scores.items():
-            content.setdefault(test or "test", {})[which] = rows
+            content.setdefault(test or OWN_SPLIT, {})[which] = rows
         return content
 
     def title(self, test: str) -> str:
         """Return the name of a test set, with its settings."""
         return f"test set {test} ({' '.join(self.tests[test])})" if test else "test split"
+
+
+def mixed_protocols(protocols: Mapping[str, str]) -> str:
+    """Return a sentence for models, by name, that are measured by several protocols; "" if by one."""
+    of: dict[str, list[str]] = {}
+    for model, protocol in protocols.items():
+        of.setdefault(protocol, []).append(model)
+    if len(of) < 2:
+        return ""
+    listed = "; ".join(f"{', '.join(models)} by {protocol}" for protocol, models in of.items())
+    return f"**Different protocols** ({listed}): where these differ, scores of one name are not comparable."

@@ -11,6 +11,7 @@ from typing import Literal
 
 from tflane_jax.ablations.comparison import compact
 from tflane_jax.ablations.held_out import load_test_data
+from tflane_jax.ablations.results import mixed_protocols
 from tflane_jax.ablations.scores import with_settings
 from tflane_jax.config import RunConfig
 from tflane_jax.config_help import meaning
@@ -56,6 +57,8 @@ def sweep(
         raise UserError(f"--setting {setting}: give a setting of the data (data...), the models are trained already")
     check_folder(out)
     _check_not_given(setting, overrides)
+    if twice := [value for value in values if list(values).count(value) > 1]:
+        raise UserError(f"--values has {twice[0]} twice: once is enough")
     runs = {name: runs_below(folder, which) for name, folder in models.items()}
     unfinished = _tell_unfinished([run for each in runs.values() for run in each]) if which == "last" else 0
     tested = {
@@ -70,7 +73,7 @@ def sweep(
         for config in (config for each in by_name.values() for config in each):
             _check_metrics(metrics or (), config.task.score_names(config.data, config.evaluation))
     scores: dict[str, list[list[dict[str, float]]]] = {name: [] for name in runs}
-    protocol = ""
+    protocols: dict[str, str] = {}
     total = len(values) * sum(map(len, runs.values()))
     with progress_bar(total=total, unit="run") as bar:
         for value in values:
@@ -82,7 +85,7 @@ def sweep(
                     for params in run.params:
                         evaluation = task.evaluate(params, data, changed.evaluation)
                         found.append(evaluation.scores())
-                    protocol = evaluation.protocol
+                    protocols[name] = evaluation.protocol
                     bar.update()
                 scores[name].append(found)
     every = [each for by_value in scores.values() for found in by_value for each in found]
@@ -93,9 +96,12 @@ def sweep(
     for i, value in enumerate(values):
         found = compact({name: by_value[i] for name, by_value in scores.items()}, metrics)
         rows += [{setting: value} | row for row in found]
+    protocol = " / ".join(dict.fromkeys(protocols.values()))
     title = f"{protocol}, test split, {which} checkpoint, percent (mean ± std over seeds)"
     if unfinished:
         title += f"; {counted(unfinished, 'run')} not finished"
+    if mixed := mixed_protocols(protocols):
+        title += f"\n\n{mixed}"
     print("\n" + format_table(rows, title=title))
     meta = {"protocol": protocol, "checkpoint": which, "setting": setting, "values": list(values), "scores": scores}
     written = list(save_table(out / "sweep", rows, meta, title=title))

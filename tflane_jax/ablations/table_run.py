@@ -264,10 +264,10 @@ def _add_geometric(trained: Mapping[str, Sequence[Job]], results: Results) -> No
 def _save_scores(table: PaperTable, results: Results, folder: Path, *, quick: bool) -> Path:
     """Print the table and the paper's own numbers, and save both as Markdown, JSON and LaTeX."""
     rows = _rows(table, results)
-    title = f"{table.name}: {table.title}. {results.protocol}, test split, percent (mean ± std over seeds)"
+    title = f"{table.name}: {table.title}. {results.protocol()}, test split, percent (mean ± std over seeds)"
     if quick:
         title = f"SMOKE TEST, a few updates on a few scenes: no result. {title}"
-    meta = {"table": table.name, "protocol": results.protocol, "seeds": list(results.seeds), "quick": quick}
+    meta = {"table": table.name, "protocol": results.protocol(), "seeds": list(results.seeds), "quick": quick}
     path, _ = save_table(folder / "table", rows, meta | {"quoted": asdict(table.quoted)}, title=title)
     text, tex = path.read_text(encoding="utf-8"), latex_table(rows, caption=title)
     if table.note:
@@ -317,7 +317,7 @@ def _save_summary(
             "title": table.title,
             "quick": quick,
             **({"steps factor": table.steps_factor} if table.steps_factor > 1 else {}),
-            "protocol": results.protocol,
+            "protocol": results.protocol(),
             "declared": declared.sentence(),
             "note": table.note,
             "seeds": list(results.seeds),

@@ -14,7 +14,7 @@ _FINDING = re.compile(
 _INTERVAL = re.compile(r"95 % ([+-][\d.]+ to [+-][\d.]+)")
 _P = re.compile(r"\bp ((?:< )?[\d.]+),")
 _SEEDS = re.compile(r"better in (\d+ of \d+) seeds")
-_OF_THE_PAPER = re.compile(r" \(([+-][^()]*)\)\.?$")
+_OF_THE_PAPER = re.compile(r"[+-]\d+(?:\.\d+)? [A-Za-z]\w*")  # in a claim: "+7.7 DET_l"
 
 
 def verdicts(found: Mapping[str, Mapping[str, Any]]) -> list[dict[str, str | None]]:
@@ -28,7 +28,8 @@ def verdicts(found: Mapping[str, Mapping[str, Any]]) -> list[dict[str, str | Non
         for finding in summary["findings"]:
             if parts := _FINDING.match(finding):
                 rest = parts["rest"] or ""
-                primary, paper = rest.split(";")[0], _OF_THE_PAPER.search(finding)
+                primary, _, claim = rest.partition(". Claim: ")
+                primary = primary.split(";")[0]
                 interval, p, seeds = (pattern.search(primary) for pattern in (_INTERVAL, _P, _SEEDS))
                 rows.append(
                     {
@@ -41,7 +42,7 @@ def verdicts(found: Mapping[str, Mapping[str, Any]]) -> list[dict[str, str | Non
                         "in": parts["measure"],
                         "p": p and p[1],
                         "better in seeds": seeds and seeds[1],
-                        "the paper": paper and paper[1],
+                        "the paper": ", ".join(_OF_THE_PAPER.findall(claim)) or None,
                     }
                 )
     return rows

@@ -13,7 +13,7 @@ from typing import Any
 from tflane_jax import accelerators
 from tflane_jax.ablations.paper.cost import core_minutes
 from tflane_jax.ablations.paper.table import Conversion, PaperTable
-from tflane_jax.ablations.published import record
+from tflane_jax.ablations.published import record, summaries
 from tflane_jax.ablations.tables import TABLES, find_table
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import check_folder
@@ -56,6 +56,8 @@ def run(options: argparse.Namespace) -> int:
     check_folder(options.out)
     if options.record is not None:
         check_folder(options.record)
+        if options.record.is_dir():
+            summaries(options.record)  # a file of something else would end the command after the trainings
     configure_jax()
     if jobs > 1 or options.cores is not None:
         accelerators.leave_to_workers()  # before converting uses a device

@@ -10,13 +10,13 @@ from tflane_jax.plots import style
 from tflane_jax.plots.figure import new_figure, save_figure
 
 _COLOURS = {"shown": style.SERIES[2], "contradicted": style.SERIES[5], "not shown": "#7a7a7a", "not tested": "#b5b5b5"}
-_LABEL = 84  # characters
+_LABEL, _HEADING = 84, 92  # characters
 _ROW = 0.2  # inches
 
 Row = Mapping[str, str | None]
 
 
-def save_claims(path: Path, rows: Sequence[Row], headings: Mapping[str, str]) -> Path:
+def save_claims(path: Path, rows: Sequence[Row], headings: Mapping[str, tuple[str, str]]) -> Path:
     """Write a picture of claims, a line each, under the headings of their tables.
 
     A diamond is what the paper reports, where that is the same measure.
@@ -24,7 +24,7 @@ def save_claims(path: Path, rows: Sequence[Row], headings: Mapping[str, str]) ->
     Args:
         path: .png, .pdf or .svg.
         rows: of `ablations.verdicts.verdicts`; those without a difference are left out.
-        headings: by name of the table.
+        headings: by name of the table, what may be shortened and what not.
     """
     from matplotlib.lines import Line2D
 
@@ -32,7 +32,9 @@ def save_claims(path: Path, rows: Sequence[Row], headings: Mapping[str, str]) ->
     drawn = [row for row in rows if _number(row["difference"]) is not None]
     for row, before in zip(drawn, [None, *drawn], strict=False):
         if before is None or row["table"] != before["table"]:
-            lines.append((f"{headings[row['table'] or '']} ({row['in']})", None))
+            heading, remark = headings[row["table"] or ""]
+            end = f" ({row['in']}){remark}"
+            lines.append((textwrap.shorten(heading, _HEADING - len(end), placeholder="...") + end, None))
         lines.append((textwrap.shorten(f"{row['treatment']}  vs.  {row['control']}", _LABEL, placeholder="..."), row))
     figure, axes = new_figure(panel=(10.5, 1.0 + _ROW * len(lines)))
     ax = axes[0, 0]
@@ -48,9 +50,10 @@ def save_claims(path: Path, rows: Sequence[Row], headings: Mapping[str, str]) ->
         if interval := row["over scenes"]:
             ax.plot([float(end) for end in interval.split(" to ")], [place, place], color=colour, lw=2.2, alpha=0.55)
         ax.plot(_number(row["difference"]), place, "o", color=colour, ms=4.5)
-        if (paper := row["the paper"]) and paper.split()[-1] == (row["in"] or "").rpartition("/")[2]:
-            ax.plot(_number(paper), place, "D", mfc="none", mec="black", ms=4.5, mew=0.9)
-            papers = True
+        for paper in (row["the paper"] or "").split(", "):
+            if paper.endswith(f" {(row['in'] or '').rpartition('/')[2]}"):
+                ax.plot(_number(paper), place, "D", mfc="none", mec="black", ms=4.5, mew=0.9)
+                papers = True
     ax.set_yticks(range(len(lines)), ["" if row is None else label for label, row in lines], fontsize=7.5)
     ax.tick_params(axis="y", length=0)
     ax.set_ylim(len(lines) - 0.5, -0.5)

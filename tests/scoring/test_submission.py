@@ -6,11 +6,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests.fakes import fake_prediction, fake_segments
+from tflane_jax.commands.submit import _record
 from tflane_jax.datasets.view_images import ImageConfig, fit_image
+from tflane_jax.evaluation.centerlines import detections_of_centerlines
+from tflane_jax.evaluation.lane_segments import detections_of_segments
 from tflane_jax.files.openlane import FrameKey
 from tflane_jax.files.plain_pickle import load_plain_pickle
 from tflane_jax.metrics.frames import ElementDetections, LaneDetections
 from tflane_jax.metrics.segment_matching import AreaDetections, SegmentDetections
+from tflane_jax.scene import Prediction
 from tflane_jax.scoring.openlane_v2 import read_predictions, read_segment_predictions
 from tflane_jax.scoring.submission import (
     Author,
@@ -193,3 +198,17 @@ def test_boxes_go_back_to_pixels_of_the_file():
     fit = fit_image(1550, 2048, ImageConfig(front_rows=(356, 1906), scale=0.5), front=True)
     boxes = np.array([[[100.0, 600.0], [180.0, 700.0]]])
     np.testing.assert_allclose(fit.in_file(fit.boxes(boxes)), boxes)
+
+
+@pytest.mark.parametrize("lanes", ["centerlines", "segments"])
+def test_a_submission_has_the_edges_that_are_evaluated(lanes):
+    """Regression: with `evaluation.topology` "geometric", `tflane eval` measured others than were submitted."""
+    lines = fake_prediction() if lanes == "centerlines" else fake_segments()
+    field = "topology_lclc" if lanes == "centerlines" else "topology_lsls"
+    answer = Prediction(**{lanes: lines})
+    learned, sums = (_record(None, answer, None, None, way)[field] for way in ("learned", "geometric"))
+    detections = detections_of_centerlines if lanes == "centerlines" else detections_of_segments
+    found = detections(lines, None, "geometric")
+    expected = found.successor if lanes == "centerlines" else found.lanes.successor
+    np.testing.assert_allclose(sums, expected, rtol=1e-6)
+    assert (np.asarray(sums) > learned).any()

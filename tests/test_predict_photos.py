@@ -214,6 +214,30 @@ def test_a_video_that_becomes_unreadable_is_a_fault(predict, tmp_path, monkeypat
     assert (found["videos"], len(found["faults"]), found["complete"]) == ([], 1, True)
 
 
+def test_a_state_that_cannot_be_written_is_no_fault_of_the_file(predict, tmp_path, monkeypatch):
+    """A full disk that is free again costs no answer; one that stays full ends the run."""
+    write, failing = predict_photos.write_json, [True]
+
+    def full(path, content):
+        if failing and (failing.pop() if len(failing) > 1 else failing[0]):
+            raise UserError("no space left")
+        write(path, content)
+
+    photo(tmp_path / "a.png")
+    monkeypatch.setattr(predict_photos, "_SAVED_EVERY", -1.0)
+    monkeypatch.setattr(predict_photos, "write_json", full)
+    with pytest.raises(UserError, match="no space left"):
+        predict("a.png")
+    video = cv2.VideoWriter(str(tmp_path / "drive.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 5, (64, 48))
+    for _ in range(3):
+        video.write(np.zeros((48, 64, 3), np.uint8))
+    video.release()
+    failing[:] = [False, True]  # full while the video is read, once
+    assert predict("drive.avi", horizon=24.0) == 0
+    found = report(tmp_path)
+    assert ([len(one["frames"]) for one in found["videos"]], found["faults"], found["complete"]) == ([3], [], True)
+
+
 def test_a_photo_with_the_longest_name_that_a_file_can_have_gets_a_picture(predict, tmp_path):
     for end in "ab":
         photo(tmp_path / "photo.png")

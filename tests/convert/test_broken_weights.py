@@ -232,7 +232,7 @@ def test_doubles_become_floats_and_counters_may_hold_anything(path):
     doubles = {name: tensor.astype(np.float64) for name, tensor in state.items()}
     doubles["layer1.0.bn1.num_batches_tracked"] = np.array(np.nan)
     doubles["n_averaged"] = np.array(7)  # of torch.optim.swa_utils
-    doubles["ema_conv1_weight"] = state["conv1.weight"] + 1.0  # of MMCV, beside the weights
+    doubles["ema_conv1_weight"] = state["conv1.weight"] + 1.0  # of MMCV's EMAHook
     again, _ = load_lstr(write(path, doubles), TINY)
     jax.tree.map(np.testing.assert_array_equal, params, again)
     assert {leaf.dtype for leaf in jax.tree.leaves(again)} == {np.dtype(np.float32)}

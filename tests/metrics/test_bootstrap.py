@@ -211,6 +211,16 @@ def test_what_a_sample_lacks_does_not_count_in_its_means():
     # Eleven attributes have neither truths nor detections, which is 1 officially; of two each frame has one.
     assert centerline.compute()["DET_t"] == 1.0
     np.testing.assert_allclose(centerline.bootstrap(weights)["DET_t"], 1.0)
+    single = CenterlineMetrics()
+    single.update(*with_elements((random_frame(0, lanes=3, detections=4)), 0))
+    lanes, truth = random_frame(1, lanes=3, detections=4)
+    nothing = CenterlineMetrics()
+    none = ElementTruth(np.zeros((0, 2, 2)), np.zeros(0, int), np.zeros((3, 0), bool))
+    found = ElementDetections(np.zeros((0, 2, 2)), np.zeros(0, int), np.zeros(0), np.zeros((4, 0)))
+    nothing.update(dataclasses.replace(lanes, elements=found), dataclasses.replace(truth, elements=none))
+    whole = single.merge(nothing)
+    assert nothing.compute_sample(whole)["DET_t"] == 1.0  # eleven attributes that no frame has
+    assert "DET_t@0" not in nothing.compute_sample(whole)
     samples = segment.bootstrap(weights)
     assert samples["AP_ped"].tolist() == [1.0, 1.0, 0.0]
     np.testing.assert_allclose(samples["mAP"][2], samples["AP_ls"][2])

@@ -126,12 +126,25 @@ def test_json_leaves_out_what_arrays_leave_out(tmp_path):
     assert {name: row[name] for name in expected} == pytest.approx(expected)
 
 
-def test_sums_of_two_confidences_are_edges_as_in_official_files(tmp_path):
+@pytest.mark.parametrize(("column", "values"), [("scores", [0.5]), ("scores", [0.5] * 40), ("visibility", [0.5])])
+def test_columns_of_another_length_are_named_beside_valid(tmp_path, capsys, column, values):
+    """Regression: a traceback, or numbers that were left out without a word."""
     predictions, truths, _ = json_frames()
+    for record in predictions if column == "scores" else truths:
+        record |= {column: values, "valid": [True] * len(record["points"])}
+    write_json(tmp_path, predictions, truths)
+    assert run(tmp_path, "json")[0] == 2
+    assert f"{column} has {len(values)} numbers for" in capsys.readouterr().err
+
+
+def test_sums_of_two_confidences_are_edges_as_in_official_files(tmp_path, capsys):
+    predictions, truths, expected = json_frames()
     for record in predictions:
         record["successor"] = (2.0 * np.array(record["successor"])).tolist()
     write_json(tmp_path, predictions, truths)
-    assert run(tmp_path, "json")[0] == 0
+    code, (row,) = run(tmp_path, "json")
+    assert (code, row["DET_l"]) == (0, pytest.approx(expected["DET_l"]))
+    assert "predicted topology exceeds 1 in 3 of 3 frames" in capsys.readouterr().err
 
 
 def test_the_plain_form_does_not_pair_with_official_files(tmp_path, capsys):

@@ -6,7 +6,7 @@ import importlib.util
 import json
 import re
 import textwrap
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +25,7 @@ _WIDTH = 120
 _CLAIMS = (
     "The difference is treatment minus control in the table's primary measure; p is corrected for the claims of the "
     "table. Negative controls and secondary measures stand with the tables below. Of an interim table, more seeds may "
-    "change a verdict. The paper's "
-    "difference is that of its own data, in the measure that stands beside it."
+    "change a verdict. The paper's difference is that of its own data, in the measure that stands beside it."
 )
 
 
@@ -67,10 +66,18 @@ def record(summaries: Sequence[Path], folder: Path) -> Path:
 def draw_claims(folder: Path) -> None:
     """Draw the claims of a folder of summaries: a picture for each group of tables, such as `markers.png`."""
     found = summaries(folder)
-    for group, names in _groups(found).items():
-        if claims := verdicts({name: found[name] for name in names}):
-            headings = {name: (_heading(found[name]), _if_interim(found[name])) for name in names}
-            save_claims(folder / f"{group}.png", claims, headings)
+    for group, claims in _drawn(found).items():
+        headings = {name: (_heading(summary), _if_interim(summary)) for name, summary in found.items()}
+        save_claims(folder / f"{group}.png", claims, headings)
+
+
+def _drawn(found: Mapping[str, Mapping[str, Any]]) -> dict[str, list[dict[str, str | None]]]:
+    """Return the claims with a number by group, which is what stands before the first dot of a table's name."""
+    groups: dict[str, list[dict[str, str | None]]] = {}
+    for name, summary in found.items():
+        if claims := [row for row in verdicts({name: summary}) if row["difference"] not in (None, "no number")]:
+            groups.setdefault(name.partition(".")[0], []).extend(claims)
+    return groups
 
 
 def page(folder: Path) -> str:
@@ -92,7 +99,7 @@ def page(folder: Path) -> str:
     linked = {f"[{name}](#{_anchor(found[name])}){_if_interim(found[name])}": found[name] for name in names}
     if claims := verdicts(linked):
         lines += ["", "## All claims", "", *_wrapped(_CLAIMS), "", format_table(claims)]
-        for group in _groups(name for name in names if found[name]["findings"]):
+        for group in _drawn(found):
             lines += ["", f"![Claims of {group}]({folder.name}/{group}.png)"]
     remarked: dict[str, str] = {}  # the table that says it first, by remark
     for name in names:
@@ -116,14 +123,6 @@ def summaries(folder: Path) -> dict[str, Mapping[str, Any]]:
         for field in ("table", "findings", "rows", "quoted"):
             member(summary, field, str(folder / f"{name}.json"))
     return {name: found[name] for name in (*TABLES, *sorted(found.keys() - TABLES.keys())) if name in found}
-
-
-def _groups(names: Iterable[str]) -> dict[str, list[str]]:
-    """Return the names of tables by what stands before the first dot."""
-    groups: dict[str, list[str]] = {}
-    for name in names:
-        groups.setdefault(name.partition(".")[0], []).append(name)
-    return groups
 
 
 def _heading(summary: Mapping[str, Any]) -> str:

@@ -59,7 +59,7 @@ class Results:
             self.samples.setdefault((test, which), {}).setdefault(row, {})[seed] = measured.samples.get(way, {})
 
     def protocol(self, test: str = OWN_TEST) -> str:
-        """Return name and version of the metrics of a test set; of all, where models are measured by several."""
+        """Return name and version of the metrics of a test set, joined by " / " if its models have several."""
         return " / ".join(dict.fromkeys(protocol for (own, _), protocol in self.protocols.items() if own == test))
 
     def mixed_protocols(self, test: str) -> str:

@@ -73,7 +73,7 @@ def sweep(
         for config in (config for each in by_name.values() for config in each):
             _check_metrics(metrics or (), config.task.score_names(config.data, config.evaluation))
     scores: dict[str, list[list[dict[str, float]]]] = {name: [] for name in runs}
-    protocols: dict[str, str] = {}
+    protocols: dict[str, dict[str, None]] = {name: {} for name in runs}
     total = len(values) * sum(map(len, runs.values()))
     with progress_bar(total=total, unit="run") as bar:
         for value in values:
@@ -85,7 +85,7 @@ def sweep(
                     for params in run.params:
                         evaluation = task.evaluate(params, data, changed.evaluation)
                         found.append(evaluation.scores())
-                    protocols[name] = evaluation.protocol
+                    protocols[name][evaluation.protocol] = None
                     bar.update()
                 scores[name].append(found)
     every = [each for by_value in scores.values() for found in by_value for each in found]
@@ -96,11 +96,12 @@ def sweep(
     for i, value in enumerate(values):
         found = compact({name: by_value[i] for name, by_value in scores.items()}, metrics)
         rows += [{setting: value} | row for row in found]
-    protocol = " / ".join(dict.fromkeys(protocols.values()))
+    by_model = {name: " / ".join(found) for name, found in protocols.items()}
+    protocol = " / ".join(dict.fromkeys(one for found in protocols.values() for one in found))
     title = f"{protocol}, test split, {which} checkpoint, percent (mean ± std over seeds)"
     if unfinished:
         title += f"; {counted(unfinished, 'run')} not finished"
-    if mixed := mixed_protocols(protocols):
+    if mixed := mixed_protocols(by_model):
         title += f"\n\n{mixed}"
     print("\n" + format_table(rows, title=title))
     meta = {"protocol": protocol, "checkpoint": which, "setting": setting, "values": list(values), "scores": scores}

@@ -68,20 +68,20 @@ def predict(trained: Run, options: argparse.Namespace) -> int:
     source = source_for(trained, options)
     if options.cameras and not isinstance(plain := sources.make_dataset(source), SimulatedDataset):
         raise UserError(f"--cameras renders scenes of the built-in world, and {plain.name} has none: leave it out")
-    dataset = sources.open_dataset(source)
-    if len(dataset) == 0:
-        raise UserError(f"nothing to predict: {dataset.name} has no examples")
-    indices = spread(len(dataset), options.count)
-    examples, answer = predict_examples(task, trained.params[0], dataset, indices)
-    infos = [dataset.info(index) for index in indices]
     evaluation = trained.config.evaluation
-    arrays = _arrays(answer, infos, evaluation.topology)
     if evaluation.traffic != "own":
         print(
             f"tflane: warning: `tflane eval` of this run has evaluation.traffic {evaluation.traffic}; these are "
             "predictions with the traffic of each frame",
             file=sys.stderr,
         )
+    dataset = sources.open_dataset(source)
+    if len(dataset) == 0:
+        raise UserError(f"nothing to predict: {dataset.name} has no examples")
+    indices = spread(len(dataset), options.count)
+    examples, answer = predict_examples(task, trained.params[0], dataset, indices)
+    infos = [dataset.info(index) for index in indices]
+    arrays = _arrays(answer, infos, evaluation.topology)
     frames = [
         _frame(info, {name: array[i] for name, array in arrays.items()}, options.threshold)
         for i, info in enumerate(infos)

@@ -15,6 +15,7 @@ predictions.json, and one picture or video (MP4) for each input:
 from __future__ import annotations
 
 import argparse
+import contextlib
 import itertools
 import sys
 import time
@@ -116,17 +117,18 @@ class _Report:
         records = self.content[kind]
         place = len(records)
 
-        def put(record: dict[str, Any]) -> None:
+        def so_far(record: dict[str, Any]) -> None:
             records[place:] = [record]
-            self._save_now_and_then()
+            with contextlib.suppress(UserError):  # a full disk is no fault of the file; the save below tells
+                self._save_now_and_then()
 
         try:
             check_name(path)
-            put(read(put))
+            records[place:] = [read(so_far)]
         except UserError as error:
             del records[place:]
             self.content["faults"].append({"file": plain_name(path), "error": str(error)})
-            self._save_now_and_then()
+        self._save_now_and_then()
 
     def _save_now_and_then(self) -> None:
         if time.monotonic() > self._next:

@@ -146,7 +146,8 @@ def _record(
 ) -> dict[str, Any]:
     """Return the best predictions of a frame; a model of both kinds of lanes submits its segments.
 
-    Edges between lanes are those that `tflane eval` measures: a sum of two confidences with geometry.
+    Edges between lanes are those that `tflane eval` measures: with the topology "geometric", the sum of learned and
+    geometric confidence, up to 2.
     """
     elements = answer.elements
     if elements is not None:

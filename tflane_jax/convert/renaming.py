@@ -95,8 +95,8 @@ def left_out(name: str) -> str | None:
     last = name.rpartition(".")[-1]
     if last in ("num_batches_tracked", "total_ops", "total_params", "n_averaged"):
         return "a counter, not needed"
-    if name == last and name.startswith("ema_"):  # of MMCV's hook, beside the weights that were trained
-        return "an average of the weights, not taken"
+    if name == last and name.startswith("ema_"):  # MMCV's hook saves the averages under the plain names
+        return "the weights beside their average (MMCV's EMAHook), not taken"
     # Weights of the coordinates in the loss of MMDetection's heads, all one.
     return "a constant of the loss, not needed" if last == "code_weights" else None
 

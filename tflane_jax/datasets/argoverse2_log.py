@@ -44,7 +44,7 @@ _BOX_COLUMNS: Mapping[str, Kind] = {
 }
 # Every fifth lidar frame is 2 Hz, the rate of OpenLane-V2.
 _FRAMES_PER_KEYFRAME = 5
-# Seconds between a key frame of OpenLane-V2 and the nearest lidar frame; cameras are some 10 ms off.
+# Most seconds between a key frame of OpenLane-V2 and the nearest lidar frame; cameras are some 10 ms off.
 _NEAR = 0.1
 # Seconds without a box after which annotations are not those of one drive.
 _QUIET = 600.0
@@ -168,13 +168,16 @@ def _drive(
 def _annotated(moments: np.ndarray, times: np.ndarray, folder: Path) -> np.ndarray:
     """Return the moments that have an annotated frame near them; warn of others, which a file cut short may lack."""
     near = np.abs(times[_nearest(times, moments)] - moments) <= _NEAR * 1e9
+    if not near.any():
+        raise UserError(
+            f"{folder / ANNOTATIONS}: no key frame of OpenLane-V2 has an annotated frame within {_NEAR:g} s: download "
+            "the file again, or take the log out"
+        )
     if not near.all():
         message = (
             f"{folder / ANNOTATIONS}: {(~near).sum()} of {len(near)} key frames have no annotated frame within "
             f"{_NEAR:g} s and are left out; if the log has road users there, download the file again"
         )
-        if not near.any():
-            raise UserError(message)
         warnings.warn(message, LeftOutWarning, stacklevel=2)
     return moments[near]
 

@@ -135,7 +135,8 @@ def _boundary_of(part: np.ndarray, line: np.ndarray, whole: np.ndarray, range_: 
     """Return the piece of a boundary that belongs to a piece of its centerline.
 
     If several pieces of the boundary are inside the range, the one nearest to the middle of the centerline's piece; if
-    none is that lies beside this piece, the part of the boundary at the same fractions of its length.
+    none is that lies beside this piece, the part of the boundary at the same fractions of its length. A boundary that
+    stays inside while its centerline leaves the range and returns is given whole to each piece of the centerline.
     """
     inside = clip_to_range(line, range_)
     if len(inside) == 1 and np.array_equal(part, whole):
@@ -153,7 +154,7 @@ def _lies_beside(piece: np.ndarray, whole: np.ndarray, start: float, stop: float
     """Return which way a boundary's piece runs beside a stretch of the centerline, or nearly so; None if it does not.
 
     A lane that leaves the range and comes back may have a centerline inside where the boundary is outside. Where it
-    turns back, the boundary between its legs lies beside both; each leg has the piece that runs its way.
+    turns back outside, the boundary between its legs lies beside both; each leg has the piece that runs its way.
     """
     first, last = (_position_along(whole, end, (start, stop)) for end in (piece[0], piece[-1]))
     if min(first, last) - stop > _BESIDE or start - max(first, last) > _BESIDE:

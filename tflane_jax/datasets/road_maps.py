@@ -137,7 +137,9 @@ def chosen_maps(root: Path, logs: Collection[str], without: Collection[str] = ()
     """
     found = {one.name: one for one in find_maps(root)}
     if missing := {*logs, *without} - set(found):
-        raise UserError(f"{root} has no log {min(missing)}, only {', '.join(found)}")
+        files = {one.files[0].stem: one.name for one in found.values()}
+        of_file = f" ({min(missing)} is the file of {files[min(missing)]})" if min(missing) in files else ""
+        raise UserError(f"{root} has no log {min(missing)}{of_file}, only {', '.join(found)}")
     maps = [one for name, one in found.items() if name in (logs or found) and name not in without]
     if not maps:
         raise UserError(f"no map of {root} is left: every log belongs to another split")

@@ -86,15 +86,14 @@ def sample_frames(path: Path, count: int) -> list[UInt8[np.ndarray, "h w 3"]]:
 
 
 def _spread(frames: Iterator[UInt8[np.ndarray, "h w 3"]], count: int) -> list[UInt8[np.ndarray, "h w 3"]]:
-    """Return `count` of any number of frames; at most twice as many are kept at a time."""
+    """Return `count` of any number of frames, fewer if there are fewer; at most twice as many are kept at a time."""
     kept: list[UInt8[np.ndarray, "h w 3"]] = []
     step = 1
     for number, frame in enumerate(frames):
         if number % step == 0:
             if len(kept) == 2 * count:
                 kept, step = kept[::2], 2 * step
-            if number % step == 0:
-                kept.append(frame)
+            kept.append(frame)
     return [kept[i * len(kept) // count] for i in range(count)] if len(kept) > count else kept
 
 

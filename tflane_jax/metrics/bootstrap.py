@@ -1,8 +1,9 @@
 """Average precisions of many bootstrap samples at once.
 
 A sample counts each frame some number of times, its weight. Frames are matched one by one, so a sample changes no
-match: only the sums over ranked detections differ. A sample has exactly the value of a data set in which frames are
-repeated as often as its weights say, up to the order of equal scores, which the official programs leave open.
+match: only the sums over ranked detections differ. The precisions of a sample are exactly those of a data set in which
+frames are repeated as often as its weights say, up to the order of equal scores, which the official programs leave
+open. In means over classes, those that the sample lacks do not count (`kept_in_sample`).
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ Every frame is matched once, with all lanes and all detections, by the official 
 
 `all` is the official number. The groups of a partition share its lanes and its vertices, and its detections in frames
 with lanes. Traffic elements and areas count only in `all` and in groups of frames. Published conventions for what the
-truth lacks hold for `all`: in a part of a map, a class without true lines has no average precision.
+truth lacks hold for `all`: in a part of a map, a class without true lines or areas has no average precision.
 """
 
 from __future__ import annotations

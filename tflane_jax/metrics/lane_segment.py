@@ -153,7 +153,7 @@ class LaneSegmentMetrics:
         """Return AP, mAP, DET, TOP and OLUS of samples that count the frames as often as `weights` says.
 
         Categories of areas are those of `compute`. The AP of one that a sample lacks is 0, and does not count in its
-        `mAP` or `DET_a`.
+        `mAP` or `DET_a`; `DET_a` is 0 where none counts.
         """
         lanes = self._lanes.bootstrap(weights)
         scores, categories, hits = pooled(self._area_detections, (0,), (len(AREA_THRESHOLDS), 0))
@@ -196,7 +196,7 @@ class LaneSegmentMetrics:
         if not areas:
             return {}
         det_a = sum(weight[name] * precision[name] for name in areas) / np.maximum(sum(weight.values()), 1.0)
-        if "DET_t" not in lanes:
+        if "DET_t" not in lanes:  # no traffic elements, or a sample without them
             return {"DET_a": det_a}
         topology = [lanes["TOP_ll"], lanes["TOP_lt"]]
         return {"DET_a": det_a, "OLUS": overall_score([lanes["DET_l"], det_a, lanes["DET_t"]], topology)}

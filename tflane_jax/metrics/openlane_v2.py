@@ -112,7 +112,7 @@ class CenterlineMetrics:
         """Return the metrics of frames that were drawn from a whole test set; `compute` has the names.
 
         An attribute that the test set has and the sample lacks is left out of `DET_t`: 0, as officially where there are
-        detections of it, would be the luck of the draw.
+        detections of it, would be the luck of the draw. Without any attribute, `DET_t` and `OLS` are missing.
         """
         return self._numbers(kept_in_sample(self._truths.sum(0)[2:], whole._truths.sum(0)[2:]))
 
@@ -142,7 +142,7 @@ class CenterlineMetrics:
             i: average_precision_11(scores[attributes == i], hits[attributes == i], int(truths[2 + i]))
             for i in np.flatnonzero(counted).tolist()
         }
-        result["DET_t"] = float(np.mean(list(precision.values()))) if precision else 0.0
+        result |= {"DET_t": float(np.mean(list(precision.values())))} if precision else {}
         result |= {f"DET_t@{i}": value for i, value in precision.items()}
         result |= topology
         return result | {name: float(value) for name, value in self._overall(result).items()}
@@ -157,7 +157,7 @@ class CenterlineMetrics:
     def bootstrap(self, weights: Weights, scope: Scope = "all") -> dict[str, Float[np.ndarray, " b"]]:
         """Return DET, AP_l, TOP and OLS of samples that count the frames as often as `weights` says.
 
-        Attributes count in `DET_t` as in `compute_sample`.
+        Attributes count in `DET_t` as in `compute_sample`; it is 0 where none does.
         """
         truths = self._truths
         scores, hits = pooled(self._lane_detections, (len(LANE_THRESHOLDS), 0))
@@ -218,7 +218,7 @@ class CenterlineMetrics:
         return {
             f"OLS{suffix}": overall_score([scores["DET_l"], scores["DET_t"]], [scores[name] for name in names])
             for suffix, names in parts.items()
-            if scores.keys() >= set(names)
+            if scores.keys() >= {"DET_t", *names}
         }
 
 

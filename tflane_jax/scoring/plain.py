@@ -12,7 +12,7 @@ crossings are no lanes and are left out.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sized
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -123,8 +123,10 @@ def _json_records(path: Path) -> Iterator[Any]:
         if "category" in given:
             kept &= ~choices(record["category"], (count,), f"{at}: category")
         rows = np.flatnonzero(kept).tolist()
-        lists = record.keys() & {"points", "scores", "visibility"}
-        found = record | {name: [items(record, name, at)[row] for row in rows] for name in lists}
+        lists = {name: items(record, name, at) for name in record.keys() & {"points", "scores", "visibility"}}
+        for name, values in lists.items():
+            _check_count(values, count, name, at)
+        found = record | {name: [values[row] for row in rows] for name, values in lists.items()}
         if "successor" in record:
             edges = fractions(record["successor"], (count, count), f"{at}: successor", largest=np.inf)
             found["successor"] = edges[np.ix_(rows, rows)]
@@ -144,6 +146,10 @@ def _successor(record: Any, where: str) -> np.ndarray:
 
 def _column(record: Any, name: str, where: str) -> np.ndarray:
     values = scores(items(record, name, where), f"{where}: {name}")
-    if len(values) != len(record["points"]):
-        raise UserError(f"{where}: {name} has {len(values)} numbers for {len(record['points'])} lanes")
+    _check_count(values, len(record["points"]), name, where)
     return values
+
+
+def _check_count(values: Sized, lanes: int, name: str, where: str) -> None:
+    if len(values) != lanes:
+        raise UserError(f"{where}: {name} has {len(values)} numbers for {lanes} lanes")

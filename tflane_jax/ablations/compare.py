@@ -115,7 +115,7 @@ def _check_tests(configs: Mapping[str, RunConfig], tests: Tests) -> None:
         raise UserError("a test set needs a name")
     if OWN_SPLIT in tests:
         raise UserError(
-            f"a test set cannot be named {OWN_SPLIT}: so comparison.json names the configurations' own split"
+            f"a test set cannot be named {OWN_SPLIT}, the name of the configurations' own split: choose another"
         )
     own = next(iter(configs.values())).data.source("test")
     for name, settings in ({OWN_TEST: ()} | dict(tests)).items():

@@ -32,10 +32,8 @@ _CLAIMS = (
 def record(summaries: Sequence[Path], folder: Path) -> Path:
     """Copy summaries (see `table_run`), if any, into the folder of results, write its page anew, and return the page.
 
-    The pictures of `draw_claims` lie in the folder.
-
     The page lies beside the folder: `docs/results` has `docs/results.md`. The runs of each table are added to those in
-    `docs/results/scores`. A summary that lacks seeds of the one that is there does not replace it, because its tests
+    `docs/results/scores`, and the pictures of `draw_claims` are drawn where matplotlib is installed. A summary that lacks seeds of the one that is there does not replace it, because its tests
     would be of fewer runs than are recorded.
 
     Raises:
@@ -95,17 +93,16 @@ def page(folder: Path) -> str:
         "([a control](comparisons.md#the-papers-tables)): runs of one configuration before and after it are not the",
         "same.",
     ]
-    names = list(found)
-    linked = {f"[{name}](#{_anchor(found[name])}){_if_interim(found[name])}": found[name] for name in names}
+    linked = {f"[{name}](#{_anchor(each)}){_if_interim(each)}": each for name, each in found.items()}
     if claims := verdicts(linked):
         lines += ["", "## All claims", "", *_wrapped(_CLAIMS), "", format_table(claims)]
         for group in _drawn(found):
             lines += ["", f"![Claims of {group}]({folder.name}/{group}.png)"]
     remarked: dict[str, str] = {}  # the table that says it first, by remark
-    for name in names:
-        note = found[name].get("note")  # earlier summaries have none
+    for name, summary in found.items():
+        note = summary.get("note")  # earlier summaries have none
         first = remarked.setdefault(note, name) if note else name
-        lines += ["", *_section(found[name], note if first == name else f"The remark on {first} holds here, too.")]
+        lines += ["", *_section(summary, note if first == name else f"The remark on {first} holds here, too.")]
     if missing := [name for name in TABLES if name not in found]:
         lines += [
             "",

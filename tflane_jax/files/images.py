@@ -103,9 +103,8 @@ def read_image(path: Path) -> UInt8[np.ndarray, "h w 3"]:
     """Return a photo as 8-bit RGB, turned upright as its EXIF record says; transparency is dropped.
 
     A JPEG decodes to the pixels of `cv2.imread`, with the channels turned round. Transparent parts of a TIFF are
-    blended with black. Raises UserError where the file cannot
-    be read, is empty, cut off, or no image of a known format with 8 or 16 bits a channel. Warns of 16-bit images that
-    use few of their bits.
+    blended with black. Raises UserError where the file cannot be read, is empty, cut off, or no image of a known format
+    with 8 or 16 bits a channel. Warns of 16-bit images that use few of their bits.
     """
     cv2, path = opencv(), Path(path)
     if fault := unreadable(path):

@@ -33,8 +33,8 @@ def record(summaries: Sequence[Path], folder: Path) -> Path:
     """Copy summaries (see `table_run`), if any, into the folder of results, write its page anew, and return the page.
 
     The page lies beside the folder: `docs/results` has `docs/results.md`. The runs of each table are added to those in
-    `docs/results/scores`, and the pictures of `draw_claims` are drawn where matplotlib is installed. A summary that lacks seeds of the one that is there does not replace it, because its tests
-    would be of fewer runs than are recorded.
+    `docs/results/scores`, and the pictures of `draw_claims` are drawn where matplotlib is installed. A summary that
+    lacks seeds of the one that is there does not replace it, because its tests would be of fewer runs than are recorded.
 
     Raises:
         UserError: a summary is of a quick run, or what was recorded before is damaged.

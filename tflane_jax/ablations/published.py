@@ -34,7 +34,7 @@ def record(summaries: Sequence[Path], folder: Path) -> Path:
 
     The page lies beside the folder: `docs/results` has `docs/results.md`. The runs of each table are added to those in
     `docs/results/scores`, and the pictures of `draw_claims` are drawn where matplotlib is installed. A summary that
-    lacks seeds of the one that is there does not replace it, because its tests would be of fewer runs than are recorded.
+    lacks seeds of the one that is there does not replace it: its tests would be of fewer runs than are recorded.
 
     Raises:
         UserError: a summary is of a quick run, or what was recorded before is damaged.

@@ -25,7 +25,7 @@ PAGES = (
 )
 # The least count of numbers in sentences that must be those of findings; docs/real_roads.md quotes others in brackets.
 FINDINGS = {
-    "README.md": 7,
+    "README.md": 4,
     "docs/tf_lane_results.md": 30,
     "docs/marker_results.md": 12,
     "docs/small_models.md": 0,
@@ -228,7 +228,9 @@ def wrong_verdicts(text, recorded):
     return wrong, count
 
 
-@pytest.mark.parametrize(("page", "least"), [("docs/tf_lane_results.md", 16), ("docs/marker_results.md", 22)])
+@pytest.mark.parametrize(
+    ("page", "least"), [("README.md", 11), ("docs/tf_lane_results.md", 16), ("docs/marker_results.md", 22)]
+)
 def test_verdicts_are_the_recorded_ones(page, least):
     text, recorded = (ROOT / page).read_text(encoding="utf-8"), summaries()
     wrong, count = wrong_verdicts(text, recorded)

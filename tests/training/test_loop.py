@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 from typing import ClassVar
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -174,6 +175,24 @@ def test_streamed_data_give_the_same_bits_and_resume_at_their_position(whole, tm
     assert after.asked == [0, *expected]  # the first one is asked for its shapes
 
 
+@pytest.mark.parametrize("step", [10, 22])  # with an evaluation and a checkpoint of its own, and without
+def test_examples_that_cannot_be_read_lose_no_update(whole, tmp_path, step, capsys):
+    class Failing(LineDataset):
+        def example(self, index):
+            if len(self.asked) > step * CONFIG.batch_size:  # one more was asked for its shapes
+                raise UserError("image 7 cannot be read")
+            return super().example(index)
+
+    folder = tmp_path / "run"
+    with pytest.raises(UserError, match="image 7"):
+        run(folder, arrays=Streamed(Failing(), StreamingConfig(threads=0)))
+    assert Checkpoints(folder / "checkpoints").steps()[-1] == step
+    assert f"step {step} is saved: go on with --resume" in capsys.readouterr().err
+    assert run(folder, start="resume", arrays=Streamed(LineDataset(), StreamingConfig(threads=0))).step == 30
+    assert arrays(folder) == arrays(whole)
+    assert timeless(folder) == timeless(whole)
+
+
 def test_a_complete_run_resumes_to_itself(whole):
     before = arrays(whole)
     assert run(whole, start="resume").step == 30
@@ -218,6 +237,25 @@ def test_numbers_of_examples_that_are_not_finite_are_named(tmp_path):
         UserError, match=r"step 1, .*Numbers of its examples are not finite either: x; see whether valid"
     ):
         run(tmp_path / "run", arrays=arrays)
+
+
+class SteepTask(LineTask):
+    """Its loss is finite everywhere, and its gradient is not where an example is 0."""
+
+    def loss(self, params, batch, key):
+        loss, terms = super().loss(params, batch, key)
+        first = batch["x"][:, 0] * params["line"]["kernel"][0, 0]
+        return loss + jnp.sqrt(jnp.abs(first)).mean(), terms
+
+
+@pytest.mark.parametrize("zero_in_step", [0, 1])
+def test_advice_where_only_the_gradient_is_not_finite(tmp_path, zero_in_step):
+    arrays = line_arrays()
+    arrays["x"][batch_indices(0, zero_in_step, len(arrays["y"]), CONFIG.batch_size)[0], 0] = 0.0
+    with pytest.raises(UserError, match=rf"step {zero_in_step + 1}, .*: grad_norm = \w+ is not finite") as error:
+        run(tmp_path / "run", task=SteepTask(), arrays=arrays)
+    first, later = "No update has been made", "clipping comes after it"
+    assert [words in str(error.value) for words in (first, later)] == [not zero_in_step, bool(zero_in_step)]
 
 
 def test_a_loss_that_is_not_finite_is_named_and_the_last_good_state_kept(whole, tmp_path):

@@ -19,6 +19,7 @@ from tflane_jax.training.schedule import (
     make_rate,
     make_schedule,
     scaled_to_batch,
+    schedule_notices,
 )
 from tflane_jax.training.vectors import layout_of, norm, ravel
 
@@ -266,6 +267,22 @@ def test_a_constant_rate_drops_at_its_steps():
     config = OptimConfig(lr=2.0, warmup_steps=2, warmup_ratio=0.5, drops=DropsConfig((4, 6), 0.1))
     rates = [float(make_rate(config, 8)(None, step)) for step in range(8)]
     np.testing.assert_allclose(rates, [1.0, 1.5, 2.0, 2.0, 0.2, 0.2, 0.02, 0.02], rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("settings", "names"),
+    [
+        ({}, []),
+        ({"epoch_steps": 9}, []),
+        ({"epoch_steps": 10}, ["optim.epoch_steps"]),
+        ({"drops": DropsConfig((4, 9))}, []),
+        ({"drops": DropsConfig((4, 10, 20))}, ["before the learning rate drops at 10"]),
+    ],
+)
+def test_what_of_the_schedule_a_run_does_not_reach_is_told(settings, names):
+    notices = schedule_notices(OptimConfig(**settings), 10)
+    assert len(notices) == len(names)
+    assert all(name in notice for name, notice in zip(names, notices, strict=True))
 
 
 @pytest.mark.parametrize(

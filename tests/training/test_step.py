@@ -193,5 +193,7 @@ def test_parts_of_a_batch_have_random_numbers_of_their_own():
     ("step", "decay", "expected"), [(0, 0.999, 0.1), (8, 0.999, 0.5), (10**6, 0.999, 0.999), (5, 0.0, 0.0)]
 )
 def test_moving_average(step, decay, expected):
-    average = moving_average({"w": jnp.array([1.0])}, {"w": jnp.array([0.0])}, step, decay)
+    before, after = ({"w": jnp.array([w]), "count": jnp.array(count)} for w, count in ((1.0, 3), (0.0, 4)))
+    average = moving_average(before, after, step, decay)
     np.testing.assert_allclose(average["w"], [expected], rtol=1e-6)
+    assert (average["count"], average["count"].dtype) == (4, before["count"].dtype)  # of a model that counts batches

@@ -6,6 +6,7 @@ import numpy as np
 import optax
 import pytest
 
+from tflane_jax.errors import UserError
 from tflane_jax.training.vectors import ROW, Vectors, any_in_leaf, layout_of, norm, ravel
 
 SHAPES = {
@@ -111,5 +112,5 @@ def test_rows_of_zeros_at_the_end_belong_to_no_leaf():
 
 
 def test_parameters_are_float32():
-    with pytest.raises(ValueError, match=r"'kernel'.*float16"):
-        layout_of({"kernel": np.zeros((2, 2), np.float16)})
+    with pytest.raises(UserError, match=r"line/kernel is float16.*param_dtype"):
+        layout_of({"line": {"kernel": np.zeros((2, 2), np.float16)}})

@@ -43,7 +43,7 @@ from tflane_jax.training.run_folder import (
     check_unchanged,
     claimed,
 )
-from tflane_jax.training.schedule import OptimConfig, make_optimizer, scaled_to_batch
+from tflane_jax.training.schedule import OptimConfig, make_optimizer, scaled_to_batch, schedule_notices
 from tflane_jax.training.sharding import placed
 from tflane_jax.training.state import init_states, of_all_seeds, per_seed, state_of
 from tflane_jax.training.step import UpdateForm, compiled_update, update_all
@@ -223,6 +223,8 @@ def train(
 
         drawn = from_first(lambda: draw is not None)  # the first process draws, from what all gather
         from_first(lambda: print_notices(begin(folder, start, resolved, resolved_text, **started_from)))
+        if is_first():
+            print_notices(schedule_notices(optim, config.steps))
 
         # =============================================================================================================
         # Compile
@@ -254,6 +256,18 @@ def train(
             kept = of_all_seeds([of_one_process(state) for state in states])
             from_first(lambda: str(checkpoints.save(kept, manifest)))
 
+        def following() -> Any:
+            """Return the batches of the next step, None after the last one or where their examples cannot be read."""
+            nonlocal unread
+            try:
+                return next(feed, None)
+            except Exception as error:
+                if count() > 1:  # the other processes would wait for this one
+                    raise
+                unread = error  # to be raised when this step is recorded and saved
+                return None
+
+        unread: Exception | None = None
         saved_step, stopped = first, stop_signal(stop.signal, 0)
         untold = dict(getattr(task, "notices", {}))
         with (
@@ -301,7 +315,7 @@ def train(
                 step += 1
                 window.add({name: value for name, value in values.items() if name != "finite"})
                 asked = time.perf_counter()
-                batch = next(feed, None)
+                batch = following()
                 ended = time.perf_counter()
                 times.add(ended - began, waited=ended - asked)
                 bar.update()
@@ -328,6 +342,9 @@ def train(
             # =========================================================================================================
             if step > saved_step:
                 save({})
+            if unread is not None:
+                print_notices([f"step {step} is saved: go on with --resume when the next examples can be read"])
+                raise unread
         rate = (step - first) / times.own if times.own else 0.0
         unfinished = stopped if step < config.steps else None
         return TrainingResult(step, metrics, compile_seconds, rate, asked_by=stopped, stopped_by=unfinished)

@@ -19,6 +19,8 @@ import optax
 from flax import struct
 from jaxtyping import Array, Bool, Float
 
+from tflane_jax.errors import UserError
+
 ROW = 64
 """Every leaf begins a new row of this many numbers; zeros fill its last row."""
 
@@ -134,12 +136,16 @@ class Vectors:
 def layout_of(params: Any) -> Layout:
     """Return the layout for a tree of learned parameters, in which kernels of one shape follow each other.
 
-    Raises ValueError if a leaf is not float32.
+    Raises UserError if a leaf is not float32.
     """
     paths, treedef = jax.tree_util.tree_flatten_with_path(params)
     for path, leaf in paths:
         if leaf.dtype != np.float32:
-            raise ValueError(f"{jax.tree_util.keystr(path)} is {leaf.dtype}: learned parameters are float32")
+            name = jax.tree_util.keystr(path, simple=True, separator="/")
+            raise UserError(
+                f"the model's parameter {name} is {leaf.dtype}, and learned parameters are float32: give its module "
+                "param_dtype float32 (its dtype may be another one); numbers that are not learned belong to its fields"
+            )
     groups = [_group(path, leaf) for path, leaf in paths]
     places = [Place(group, 0, tuple(leaf.shape)) for group, (_, leaf) in zip(groups, paths, strict=True)]
     ends = dict.fromkeys(groups, 0)

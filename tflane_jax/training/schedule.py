@@ -192,9 +192,7 @@ def schedule_notices(config: OptimConfig, steps: int) -> list[str]:
     """
     notices = []
     if config.epoch_steps >= steps:
-        notices.append(
-            f"optim.epoch_steps: the run of {steps} steps has no second epoch, and so one learning rate"
-        )
+        notices.append(f"optim.epoch_steps: the run of {steps} steps has no second epoch, and so one learning rate")
     if config.drops is not None and (late := [drop for drop in config.drops.steps if drop >= steps]):
         notices.append(f"optim.drops.steps: the run ends at step {steps}, before the learning rate drops at {late[0]}")
     return notices

@@ -71,7 +71,7 @@ def test_arguments_are_read_as_those_of_the_whole_configuration(arguments):
     except SystemExit:
         with pytest.raises(UserError) as error:
             apply_overrides(FLOW, arguments)
-        assert str(error.value) == _without_boxes(output.getvalue())
+        assert str(error.value) == _without_boxes(output.getvalue(), FLOW)
     else:
         assert apply_overrides(FLOW, arguments) == whole
 
@@ -123,6 +123,8 @@ def test_settings_of_other_data_can_be_changed():
         (["--training.steps", "ten"], "^--training.steps is 'ten': it must be a whole number$"),
         (["--training.steps", "1.5"], "^--training.steps is '1.5': it must be a whole number$"),
         (["--optim.lr", "high"], "^--optim.lr is 'high': it must be a number$"),
+        (["--training.seeds", "1", "a"], "^--training.seeds cannot be 1 a: it must be a tuple, each item a whole"),
+        (["--data.world.roads.kinds", "RUNDABOUT", "1"], r"RUNDABOUT 1: it must be .* \(ROAD or .* ROUNDABOUT or"),
         (["--no-training.same-examples"], r"did you mean --training\.no-same-examples\?"),
         (["--training.same-examples", "False"], r"is a flag .* or --training\.no-same-examples for False"),
         (["--training.no-same-examples=True"], r"^--training\.same-examples is a flag without a value"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import contextlib
 import dataclasses
 import difflib
@@ -16,7 +17,7 @@ from typing import Any
 from tflane_jax.config import RunConfig, with_reference_batch, with_same_examples
 from tflane_jax.config_io import choices, settings, with_setting
 from tflane_jax.errors import UserError
-from tflane_jax.limits import check_settings
+from tflane_jax.limits import allowed_for, check_settings
 from tflane_jax.own_modules import is_own
 
 # Settings by their names in other programs.
@@ -30,7 +31,8 @@ _SYNONYMS = {
 _NO_NUMBER = re.compile(
     r"Error parsing (--\S+): (?:(invalid literal for int\(\) with base 10)|could not convert string to float): ('.*')"
 )
-# Its message about arguments that no option takes.
+# tyro's messages about several values of which one is wrong, and about arguments that no option takes.
+_NO_PARSE = re.compile(r"Error parsing (--\S+): Could not find valid parse for arguments: (\[.*\])")
 _LEFT_OVER = "Unrecognized options: "
 
 
@@ -60,7 +62,7 @@ def apply_overrides(config: RunConfig, arguments: Sequence[str]) -> RunConfig:
         with contextlib.redirect_stderr(output), contextlib.redirect_stdout(output):
             parsed = tyro.cli(kind, default=default, args=list(arguments), config=(tyro.conf.AvoidSubcommands,))
     except SystemExit as error:
-        raise UserError(_without_boxes(output.getvalue())) from error
+        raise UserError(_without_boxes(output.getvalue(), config)) from error
     changed = with_same_examples(with_reference_batch(_merged(config, parsed), given), given, names)
     check_settings(changed, "--")
     return changed
@@ -197,8 +199,8 @@ def _closest(name: str, known: list[str]) -> list[str]:
     return [k for part in parts for k in by_last[part]][:3]
 
 
-def _without_boxes(text: str) -> str:
-    """Return tyro's error message as one line, without frame, title and hints."""
+def _without_boxes(text: str, config: RunConfig) -> str:
+    """Return tyro's error message as one line, without frame, title and hints, with what settings of `config` may be."""
     # tyro prints a title, a rule (unless framed), the message, a rule, hints.
     lines = [re.sub(r"[│─╭╮╰╯]|-{3,}", " ", line).strip() for line in text.splitlines()[1:]]
     paragraphs = re.split(r"\n{2,}", "\n".join(lines).strip())
@@ -206,6 +208,9 @@ def _without_boxes(text: str) -> str:
     if message.startswith(_LEFT_OVER):
         first = message.removeprefix(_LEFT_OVER).split()[0].rstrip(",")
         return f"{first} is neither a setting nor the value of one: settings are given as, say, --optim.lr 1e-3"
+    if (wrong := _NO_PARSE.search(message)) is not None:
+        name, values = wrong[1], ast.literal_eval(wrong[2])
+        return f"{name} cannot be {' '.join(values)}: it must be {allowed_for(config, _setting(name))}"
     if (wrong := _NO_NUMBER.search(message)) is None:
         return message
     name, whole, value = wrong.groups()

@@ -175,6 +175,13 @@ def _dataclasses(name: str, value: Any) -> Iterator[tuple[str, Any]]:
         yield name, value
 
 
+def allowed_for(config: Any, setting: str) -> str:
+    """Return in words what a setting of a configuration, by its dotted name, may be."""
+    part, _, name = setting.rpartition(".")
+    kind = type(attrgetter(part)(config) if part else config)
+    return _described(next(hint for field, hint, _ in _checks(kind) if field == name))
+
+
 def forget_types() -> None:
     """Look at the types of settings again, because a union of classes has got another member."""
     _checks.cache_clear()

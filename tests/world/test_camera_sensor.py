@@ -56,6 +56,17 @@ def test_paint_lies_where_geometry_projects_it(empty_street, y):
     assert abs(np.mean(errors)) < 0.25
 
 
+@pytest.mark.parametrize("pitch", [30.0, 90.0])
+def test_a_camera_that_sees_only_ground_sees_the_road(pitch):
+    """Regression: the sky was looked for in no pixel, which ended with an error of OpenCV."""
+    down = replace(FRONT, cameras=(replace(NUSCENES_RING[0], pitch=pitch),))
+    grey = brightness(render_cameras(scene(street()), 0, down))
+    assert grey.min() > 0.0
+    assert np.median(grey) == pytest.approx(
+        np.median(brightness(render_cameras(scene(street()), 0, FRONT))[-40:]), rel=0.2
+    )
+
+
 def test_crossing_is_painted_between_its_corners():
     """Paint between the edges of the crossing, asphalt a metre before and behind it."""
     plain, marked = (render_cameras(scene(street(crossing=there)), 0, FRONT) for there in (False, True))

@@ -7,6 +7,7 @@ import pytest
 
 from tflane_jax.errors import UserError
 from tflane_jax.limits import check_settings
+from tflane_jax.world.cameras.ring import NUSCENES_RING, CameraRigConfig
 from tflane_jax.world.front_view.road import HighwayConfig
 from tflane_jax.world.front_view.traffic import FrontTrafficConfig
 from tflane_jax.world.front_view.views import FrontWorldConfig
@@ -57,11 +58,23 @@ def test_impossible_settings_are_named(config, setting):
         check_settings(config)
 
 
+def test_a_camera_below_the_road_is_named():
+    below = CameraRigConfig(cameras=(NUSCENES_RING[1], replace(NUSCENES_RING[0], z=-1.0)))
+    with pytest.raises(UserError, match=r"^cameras\[1\]\.z is -1\.0: it must be"):
+        check_settings(below)
+
+
 @pytest.mark.parametrize(
     ("kind", "settings", "remedy"),
     [
         (SceneKind.TWO_JUNCTIONS, {"corner_radius": (30.0, 30.0)}, "raise reach or junction_distance"),
         (SceneKind.ROAD, {"reach": 60.0, "ego_reach": 50.0}, "raise ego_reach and reach"),
+        (SceneKind.FOUR_WAY, {"pocket": (200.0, 200.0)}, "do not fit into a street of .* m: lower pocket"),
+        (
+            SceneKind.FOUR_WAY,
+            {"reach": 80.0, "ego_reach": 70.0, "pocket": (63.0, 63.0)},
+            "do not fit into a street of .* m: lower pocket",
+        ),
     ],
 )
 def test_roads_without_room_say_what_gives_them_some(kind, settings, remedy):

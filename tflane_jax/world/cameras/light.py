@@ -150,17 +150,21 @@ def look(camera: PinholeCamera) -> View:
 
 
 def show_sky(view: View, panorama: UInt8[np.ndarray, "k l 3"], yaw: float) -> UInt8[np.ndarray, "H W 3"]:
-    """Return the part of the panorama seen by a camera of a vehicle with heading `yaw`; rows with ground only are
-    black."""
+    """Return the part of the panorama seen by a camera of a vehicle with heading `yaw`.
+
+    Rows with ground only are black: all of them where a camera looks down.
+    """
     import cv2
 
     rows, columns = panorama.shape[:2]
     needed = np.flatnonzero(~view.seen.all(1))
     part = slice(0, view.first_row + (int(needed[-1]) + 1 if len(needed) else 0))
+    image = np.zeros((view.camera.height, view.camera.width, 3), np.uint8)
+    if not part.stop:
+        return image
     u = (view.azimuth[part] + np.float32(yaw)) * np.float32(columns / (2.0 * np.pi)) - np.float32(0.5)
     v = (_HIGHEST - view.elevation[part]) * np.float32(rows / (_HIGHEST - _LOWEST)) - np.float32(0.5)
     np.clip(v, 0.0, rows - 1.0, out=v)
-    image = np.zeros((view.camera.height, view.camera.width, 3), np.uint8)
     image[part] = cv2.remap(panorama, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
     return image
 

@@ -43,7 +43,7 @@ class CameraMount:
     name: str
     x: float
     y: float
-    z: float
+    z: Positive
     yaw: float
     pitch: float
     focal: Positive

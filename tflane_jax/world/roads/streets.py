@@ -22,6 +22,8 @@ from tflane_jax.world.roads.lane_network import Draft, LaneEnd, LaneNetwork
 _CLOSEST_CUTS = 6.0
 # No street is shorter, and its median has room for round noses, metres.
 _SHORTEST = 6.0
+# No segment between cuts is shorter, metres; those of the presets have 3.7 and more.
+_SHORTEST_SEGMENT = 1.0
 
 
 @dataclass(frozen=True)
@@ -96,7 +98,7 @@ def build_street(plan: StreetPlan, network: LaneNetwork, solid_before_stop: floa
         solid_before_stop: length of the solid divider before a stop line, metres.
         spacing: largest distance between vertices, metres.
 
-    Raises UserError if intersections leave no room for it.
+    Raises UserError if intersections leave no room for it, or its extra lanes for segments between them.
     """
     length = plan.stop - plan.start
     least = _SHORTEST + plan.forward.inner + plan.backward.inner
@@ -112,6 +114,12 @@ def build_street(plan: StreetPlan, network: LaneNetwork, solid_before_stop: floa
     solid_b = length - solid_before_stop if plan.stops_at_start else length
     cuts_f = _cuts(forward, length, (low, high), solid_f)
     cuts_b = _cuts(backward, length, (length - high, length - low), solid_b)
+    for cuts in (cuts_f, cuts_b):
+        if cuts[0] < 0.0 or cuts[-1] > length or np.diff(cuts).min() < _SHORTEST_SEGMENT:
+            raise UserError(
+                f"roads: turning, merging and opening lanes do not fit into a street of {length:.1f} m: lower pocket, "
+                "taper, fast_taper or corner_radius, or raise reach or junction_distance"
+            )
     stations = grid_with([*(plan.start + cuts_f), *(plan.stop - cuts_b)], spacing)
     line = clothoid_line(plan.origin, plan.heading, stations, plan.bends)
     onward = ReferenceLine(line.s - plan.start, line.xy, line.heading)

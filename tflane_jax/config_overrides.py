@@ -200,7 +200,7 @@ def _closest(name: str, known: list[str]) -> list[str]:
 
 
 def _without_boxes(text: str, config: RunConfig) -> str:
-    """Return tyro's error message as one line, without frame, title and hints, with what settings of `config` may be."""
+    """Return tyro's error message as one line: no frame, title or hints, but what a setting of `config` may be."""
     # tyro prints a title, a rule (unless framed), the message, a rule, hints.
     lines = [re.sub(r"[│─╭╮╰╯]|-{3,}", " ", line).strip() for line in text.splitlines()[1:]]
     paragraphs = re.split(r"\n{2,}", "\n".join(lines).strip())

@@ -42,7 +42,7 @@ def save_claims(path: Path, rows: Sequence[Row], headings: Mapping[str, tuple[st
     papers = False
     for place, (label, row) in enumerate(lines):
         if row is None:
-            ax.axhspan(place - 0.5, place + 0.5, color="#e8e8e8", lw=0)
+            ax.axhspan(place - 0.5, place + 0.5, color="#e8e8e8", lw=0, zorder=2.5)  # above the line at 0
             across = ax.get_yaxis_transform()
             ax.text(0.01, place, label, transform=across, fontsize=7.5, fontweight="bold", va="center")
             continue

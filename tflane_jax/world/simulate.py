@@ -249,8 +249,8 @@ def _drive(
             return network, traffic, on_roads
     raise UserError(
         f"the roads of scene {scene_id} are too short: in {_DRIVES} drives, the vehicle was at their end before "
-        f"{config.keyframes} key frames with {history} frames of history. Raise roads.reach and roads.ego_reach, or "
-        "lower duration_s or traffic.ego_top_speed"
+        f"{config.keyframes} key frames with {history} frames ({history / config.rate_hz:g} s) of history. Raise "
+        "roads.reach and roads.ego_reach, or rate_hz, or lower duration_s or traffic.ego_top_speed"
     )
 
 

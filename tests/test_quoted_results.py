@@ -206,16 +206,16 @@ def wrong_verdicts(text, recorded):
     """Return what is wrong with the tables below `<!-- verdicts: PATTERN ... -->`, and how many cells they quote.
 
     The last columns quote findings of the tables that match the patterns, in their order; a cell that quotes none must
-    say so.
+    say so. Below `<!-- verdicts by row: NAME ... -->` the last column does, each row of a table of its own.
     """
     wrong, count = [], 0
     for above, header, rows in tables(text):
-        if named := re.fullmatch(r"<!-- verdicts: (.+) -->", above):
-            patterns = named[1].split()
-            for row in rows:
-                for column, pattern, cell in zip(
-                    header[-len(patterns) :], patterns, row[-len(patterns) :], strict=True
-                ):
+        if named := re.fullmatch(r"<!-- verdicts( by row)?: (.+) -->", above):
+            patterns = named[2].split()
+            of_rows = [[name] for name in patterns] if named[1] else [patterns] * len(rows)
+            for row, quoted in zip(rows, of_rows, strict=True):
+                columns, cells = header[-len(quoted) :], row[-len(quoted) :]
+                for column, pattern, cell in zip(columns, quoted, cells, strict=True):
                     names = fnmatch.filter(recorded, pattern)
                     found = {
                         f"{verdict['verdict']} {verdict['difference'].removesuffix(' points')}"

@@ -206,7 +206,7 @@ def wrong_verdicts(text, recorded):
     """Return what is wrong with the tables below `<!-- verdicts: PATTERN ... -->`, and how many cells they quote.
 
     The last columns quote findings of the tables that match the patterns, in their order; a cell that quotes none must
-    say so. Below `<!-- verdicts by row: NAME ... -->` the last column does, each row of a table of its own.
+    say so. Below `<!-- verdicts by row: PATTERN ... -->` only the last column quotes, each row by a pattern of its own.
     """
     wrong, count = [], 0
     for above, header, rows in tables(text):

@@ -38,18 +38,22 @@ def not_finite(
     what = ", ".join(f"{name} = {numbers[name]}" for name in terms)
     fields = _not_finite_in(batches[bad]) if batches else ""
     data = f"Numbers of its examples are not finite either: {fields}; see whether valid ones are. " if fields else ""
-    found = f"step {step + 1}, seed {seeds[bad]}: {what} is not finite. {data}The last good state (step {step}) is kept"
     if step == 0:
-        return (
-            f"{found} in {kept}. No update has been made, so the optimiser's settings are not the cause: look at the "
-            "first examples, the parameters that it starts from, and the settings of model and losses"
+        advice = (
+            "No update has been made, so the optimiser's settings are not the cause: look at the first examples, the "
+            "parameters that the run starts from, and the settings of model and losses"
         )
-    only_gradient = terms == ["grad_norm"]
-    clipping = "" if only_gradient else " or optim.clip_norm"
-    why = " The loss is finite and its gradient is not; clipping comes after it and cannot help." * only_gradient
+    else:
+        lower = "optim.lr or optim.clip_norm"
+        if terms == ["grad_norm"]:
+            lower = "optim.lr (the loss is finite and its gradient is not: clipping comes after it and cannot help)"
+        advice = (
+            f"Lower {lower} and train into another folder, from the start or from this run's averaged parameters "
+            "(training.init_from)"
+        )
     return (
-        f"{found} in {kept}.{why} Lower optim.lr{clipping} and train into another folder, from the start or from this "
-        "run's averaged parameters (training.init_from)"
+        f"step {step + 1}, seed {seeds[bad]}: {what} is not finite. {data}The last good state (step {step}) is kept in "
+        f"{kept}. {advice}"
     )
 
 

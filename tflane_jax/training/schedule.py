@@ -78,8 +78,8 @@ class OptimConfig:
         final_ratio: last learning rate relative to `lr`; `restarts` have their own.
         weight_decay: on the parameters that `decayed` names.
         decayed: "kernels" and embeddings, or "all", biases and norms too, as the published camera hosts train.
-        decay: "decoupled" from the gradient (AdamW), or "coupled": added to it, after clipping (PyTorch's Adam; but
-            parameters of which no gradient has come in an update, as of a prior that its batch lacks, have none in it).
+        decay: "decoupled" from the gradient (AdamW), or "coupled": added to it, after clipping (PyTorch's Adam,
+            except that a parameter whose gradient is zero everywhere in an update does not decay in it).
         optimizer: of the kernels that `muon_kernels` names; all other parameters have Adam. "muon" (Jordan et al.
             2024) orthogonalises the updates. None of the three papers uses it; docs/cameras.md has its effect on
             small models.
@@ -186,13 +186,10 @@ def make_schedule(config: OptimConfig, steps: int) -> optax.Schedule:
 
 
 def schedule_notices(config: OptimConfig, steps: int) -> list[str]:
-    """Return what of the learning rate's schedule does not happen in a run of `steps` updates, such as a shortened one.
-
-    This is no error: a first try of a long recipe needs none of it.
-    """
+    """Return notices of changes of the learning rate that a run of `steps` updates never reaches."""
     notices = []
     if config.epoch_steps >= steps:
-        notices.append(f"optim.epoch_steps: the run of {steps} steps has no second epoch, and so one learning rate")
+        notices.append(f"optim.epoch_steps: the run ends at step {steps}, before an epoch lowers the learning rate")
     if config.drops is not None and (late := [drop for drop in config.drops.steps if drop >= steps]):
         notices.append(f"optim.drops.steps: the run ends at step {steps}, before the learning rate drops at {late[0]}")
     return notices

@@ -224,8 +224,8 @@ def _over_parts(
 def moving_average(average: Any, params: Any, step: int | Int[Array, ""], decay: float | Float[Array, ""]) -> Any:
     """Return d * average + (1 - d) * params with d = min(decay, (1 + step) / (10 + step)).
 
-    The second bound removes the initial parameters from the average early, so that it can evaluate short runs. What is
-    no float, such as a count of batches among the statistics, has no mean: there it is that of `params`.
+    The second bound removes the initial parameters from the average early, so that it can evaluate short runs. Leaves
+    that are not floats, such as a count of batches among the statistics, are taken from `params`.
     """
     d = jnp.minimum(decay, (1.0 + step) / (10.0 + step))
 

@@ -144,7 +144,7 @@ def layout_of(params: Any) -> Layout:
             name = jax.tree_util.keystr(path, simple=True, separator="/")
             raise UserError(
                 f"the model's parameter {name} is {leaf.dtype}, and learned parameters are float32: give its module "
-                "param_dtype float32 (its dtype may be another one); numbers that are not learned belong to its fields"
+                "param_dtype float32 (its dtype may be another one), or make a constant an attribute of the module"
             )
     groups = [_group(path, leaf) for path, leaf in paths]
     places = [Place(group, 0, tuple(leaf.shape)) for group, (_, leaf) in zip(groups, paths, strict=True)]

@@ -22,7 +22,7 @@ from tflane_jax.world.roads.lane_network import Draft, LaneEnd, LaneNetwork
 _CLOSEST_CUTS = 6.0
 # No street is shorter, and its median has room for round noses, metres.
 _SHORTEST = 6.0
-# No segment between cuts is shorter, metres; those of the presets have 3.7 and more.
+# No segment between cuts is shorter, metres.
 _SHORTEST_SEGMENT = 1.0
 
 

@@ -45,21 +45,25 @@ def test_prediction_of_segments_adds_boundaries_and_types(tmp_path, monkeypatch)
         predict_lanes.predict(Run("run", RunConfig(), 1, ({},)), options)
 
 
-def test_predicted_edges_are_those_that_are_evaluated(tmp_path, monkeypatch, capsys):
-    """Regression: those of a run with `evaluation.topology` "geometric" were the learned ones."""
+def test_predictions_are_those_that_are_evaluated(tmp_path, monkeypatch, capsys):
+    """Regression: edges of `evaluation.topology` "geometric" were the learned ones, traffic "none" was not taken."""
     dataset, segments = FakeDataset(FakeConfig(2)), fake_segments()
-    answer = stack_examples([dataset.example(0)]), Prediction(segments=stack_examples([segments]))
+    seen = []
+
+    def predict_examples(task, params, dataset, indices):
+        seen.append(stack_examples([dataset.example(index) for index in indices]))
+        return seen[-1], Prediction(segments=stack_examples([segments]))
+
     monkeypatch.setattr(predict_lanes, "source_for", lambda *_: RunConfig().data.source("val"))
     monkeypatch.setattr(predict_lanes.sources, "open_dataset", lambda *_: dataset)
-    monkeypatch.setattr(predict_lanes, "predict_examples", lambda *_: answer)
+    monkeypatch.setattr(predict_lanes, "predict_examples", predict_examples)
     found = {}
     for topology in ("learned", "geometric"):
         options = Namespace(count=1, out=tmp_path / topology, threshold=0.5, max_instances=None, cameras=False)
         config = RunConfig(evaluation=EvaluationConfig(topology=topology, traffic="none"))
         assert predict_lanes.predict(Run("run", config, 1, ({},)), options) == 0
-        assert (
-            "evaluation.traffic none; these are predictions with the traffic of each frame" in capsys.readouterr().err
-        )
+        assert "evaluation.traffic is none, also in the pictures" in capsys.readouterr().out
+        assert not seen[-1].traffic_flow.valid.any()
         found[topology] = np.load(tmp_path / topology / "predictions.npz")["successor"][0]
     points, logits = np.asarray(segments.points), np.asarray(segments.successor_logits)
     np.testing.assert_allclose(found["geometric"], edge_confidences(points, logits, "geometric"), rtol=1e-6)

@@ -8,7 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tflane_jax.datasets.batches import batch_indices, batches
+from tflane_jax.datasets.batches import batch_indices, batches, first_example
+from tflane_jax.errors import UserError
 
 
 @settings(max_examples=30)
@@ -51,6 +52,11 @@ def test_examples_are_prepared_by_seed_step_and_place(seeds):
 
 def test_no_steps_no_batches():
     assert list(batches({"a": np.arange(3)}, (0,), range(0), 2)) == []
+
+
+def test_no_examples_are_an_error():
+    with pytest.raises(UserError, match="there are no examples"):
+        first_example({"a": np.zeros((0, 3))})
 
 
 def test_an_error_while_gathering_reaches_the_caller():

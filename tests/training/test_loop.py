@@ -335,16 +335,15 @@ def test_the_batch_scales_the_rate_and_passes_in_parts(tmp_path):
     assert first["learning_rate"] == pytest.approx(2 * OPTIM.lr)
 
 
+def test_scores_may_be_of_numpy_or_jax(tmp_path):
+    config = dataclasses.replace(CONFIG, steps=4)
+    result = run(tmp_path / "run", config=config, evaluate=lambda _: {"score": np.float32(2), "other": jnp.ones(())})
+    assert result.metrics == {"score": 2.0, "other": 1.0}
+
+
 def test_training_needs_no_evaluation(tmp_path):
     config = dataclasses.replace(CONFIG, steps=3)
-    result = train(
-        LineTask(),
-        line_arrays(),
-        tmp_path / "run",
-        config=config,
-        optim=dataclasses.replace(OPTIM, warmup_steps=0),
-        resolved=RESOLVED,
-        progress=False,
-    )
+    how = {"config": config, "optim": dataclasses.replace(OPTIM, warmup_steps=0), "resolved": RESOLVED}
+    result = train(LineTask(), line_arrays(), tmp_path / "run", progress=False, **how)
     assert (result.step, result.metrics) == (3, {})
     assert Checkpoints(tmp_path / "run" / "checkpoints").find("last") == 3

@@ -28,10 +28,9 @@ predictions.json, lanes with a score of at least `threshold`, best first:
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import jax
 import numpy as np
@@ -46,6 +45,7 @@ from tflane_jax.datasets.data_source import LaneGraphSource
 from tflane_jax.datasets.procedural import SimulatedDataset
 from tflane_jax.errors import UserError
 from tflane_jax.evaluation.geometric_topology import Topology, edge_confidences
+from tflane_jax.evaluation.interventions import dataset_with_traffic
 from tflane_jax.evaluation.predict import predict_examples
 from tflane_jax.files.atomic import replacing, write_json
 from tflane_jax.plots import save_camera_views, save_examples
@@ -69,15 +69,12 @@ def predict(trained: Run, options: argparse.Namespace) -> int:
     if options.cameras and not isinstance(plain := sources.make_dataset(source), SimulatedDataset):
         raise UserError(f"--cameras renders scenes of the built-in world, and {plain.name} has none: leave it out")
     evaluation = trained.config.evaluation
-    if evaluation.traffic != "own":
-        print(
-            f"tflane: warning: `tflane eval` of this run has evaluation.traffic {evaluation.traffic}; these are "
-            "predictions with the traffic of each frame",
-            file=sys.stderr,
-        )
     dataset = sources.open_dataset(source)
     if len(dataset) == 0:
         raise UserError(f"nothing to predict: {dataset.name} has no examples")
+    if evaluation.traffic != "own":
+        print(f"as `tflane eval` of this run: evaluation.traffic is {evaluation.traffic}, also in the pictures")
+        dataset = cast(Dataset, dataset_with_traffic(dataset, evaluation.traffic))
     indices = spread(len(dataset), options.count)
     examples, answer = predict_examples(task, trained.params[0], dataset, indices)
     infos = [dataset.info(index) for index in indices]

@@ -62,7 +62,9 @@ def count(arrays: Any) -> int:
 
 
 def first_example(arrays: Any) -> Any:
-    """Return one example."""
+    """Return one example; raises UserError if there is none."""
+    if count(arrays) == 0:
+        raise UserError("there are no examples: nothing can be trained or evaluated on them")
     return arrays.example(0) if isinstance(arrays, Streamed) else row_of(arrays, 0)
 
 

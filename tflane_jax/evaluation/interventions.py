@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -35,11 +35,18 @@ def with_traffic(arrays: Example | Streamed, traffic: Traffic) -> Example | Stre
     """
     if traffic == "own":
         return arrays
-    rows = other_scene_rows(scene_numbers(arrays)) if traffic == "other-scene" else None
     if isinstance(arrays, Streamed):
-        return replace(arrays, dataset=_Changed(arrays.dataset, rows))
+        return replace(arrays, dataset=dataset_with_traffic(arrays.dataset, traffic))
+    rows = other_scene_rows(scene_numbers(arrays)) if traffic == "other-scene" else None
     flow = _flow(arrays)
     return replace(arrays, traffic_flow=_none(flow) if rows is None else jax.tree.map(lambda leaf: leaf[rows], flow))
+
+
+def dataset_with_traffic(dataset: IndexedExamples, traffic: Traffic) -> IndexedExamples:
+    """Return a dataset whose examples have other traffic flow, like `with_traffic`."""
+    if traffic == "own":
+        return dataset
+    return _Changed(dataset, other_scene_rows(_scenes_of(dataset)) if traffic == "other-scene" else None)
 
 
 def traffic_interventions(arrays: Example | Streamed, config: EvaluationConfig) -> dict[str, EvaluationConfig]:
@@ -58,12 +65,15 @@ def traffic_interventions(arrays: Example | Streamed, config: EvaluationConfig) 
 def scene_numbers(arrays: Example | Streamed) -> Int[np.ndarray, " n"]:
     """Return the number of each example's scene, 0 for the first."""
     if isinstance(arrays, Streamed):
-        names = [arrays.dataset.info(index).scene for index in range(len(arrays))]
-        starts = np.array([index > 0 and name != names[index - 1] for index, name in enumerate(names)], int)
-    else:
-        starts = ~np.asarray(arrays.has_previous)
-        starts[:1] = False
+        return _scenes_of(arrays.dataset)
+    starts = ~np.asarray(arrays.has_previous)
+    starts[:1] = False
     return np.cumsum(starts)
+
+
+def _scenes_of(dataset: IndexedExamples) -> Int[np.ndarray, " n"]:
+    names = [dataset.info(index).scene for index in range(len(dataset))]
+    return np.cumsum(np.array([index > 0 and name != names[index - 1] for index, name in enumerate(names)], int))
 
 
 def other_scene_rows(scene: Int[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
@@ -83,16 +93,11 @@ def other_scene_rows(scene: Int[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
     return first[giver] + (np.arange(len(scene)) - first[scene]) % size[giver]
 
 
-@dataclass(frozen=True, eq=False)
 class _Changed:
     """A dataset whose examples get the traffic of others, `rows` by index, or none."""
 
-    dataset: IndexedExamples
-    rows: Int[np.ndarray, " n"] | None
-
-    @property
-    def name(self) -> str:
-        return self.dataset.name
+    def __init__(self, dataset: IndexedExamples, rows: Int[np.ndarray, " n"] | None):
+        self.name, self.dataset, self.rows = dataset.name, dataset, rows
 
     def __len__(self) -> int:
         return len(self.dataset)

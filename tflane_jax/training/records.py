@@ -196,7 +196,7 @@ class Window:
 
 def by_name(every: Sequence[Mapping[str, float]]) -> dict[str, list[float]]:
     """Return the values that all seeds have, a list of one per seed by name."""
-    return {name: [one[name] for one in every] for name in every[0] if all(name in one for one in every)}
+    return {name: [float(one[name]) for one in every] for name in every[0] if all(name in one for one in every)}
 
 
 def seed_record(step: int, split: str, values: dict[str, list[float]]) -> Record:

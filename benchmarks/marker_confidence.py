@@ -5,6 +5,9 @@
 The test split of `configs/markers/` with the paper's simulation, against the same frames without noise. The error of
 a detection is the mean displacement of the ground from 10 m behind to 30 m ahead of the vehicle. The other columns say
 by how much the detection's own lanes enter Eq. (3) in the rows of Table II: the weight of their tokens times c.
+
+A second table counts the frames in which lanes, seen or remembered, enter Eq. (3) at all. A board that hard masking
+ignores still keeps memory from being read; with epsilon at the threshold of the mask, 0.5, it does not.
 """
 
 from __future__ import annotations
@@ -43,6 +46,17 @@ FUSIONS = {
 }
 
 
+_HARD = dataclasses.replace(SMALL_MARKER_FUSION, fusion="hard")
+assert _HARD.memory is not None
+ENTERING = {
+    "gated": SMALL_MARKER_FUSION,
+    "hard masking": _HARD,
+    "hard masking, epsilon 0.5": dataclasses.replace(
+        _HARD, memory=dataclasses.replace(_HARD.memory, threshold=_HARD.hard_threshold)
+    ),
+}
+
+
 class _Factor:
     """How much the lanes of a frame's own markers enter Eq. (3), frame by frame."""
 
@@ -54,16 +68,21 @@ class _Factor:
         prior = self._config.build(HostSpec(1, box, box))
         self._observe, self._bank = jax.jit(prior.observe), prior.start()
 
-    def of(self, example: Example) -> float:
-        """Return the largest factor of the frame's lanes, 0 if only remembered ones are used."""
+    def of(self, example: Example) -> tuple[float, float]:
+        """Return the largest factor of the frame's lanes, 0 if only remembered ones are used, and that of all lanes."""
         guide, self._bank = self._observe(example, self._bank)
         gate, valid = fusion_gate(guide, self._config)
-        own = slice(self._config.prior.lanes)
-        return float(gate * (guide.weight * valid)[own].max())
+        factors = np.asarray(gate * guide.weight * valid)
+        return float(factors[: self._config.prior.lanes].max()), float(factors.max())
 
 
-def measure(scenes: int) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
-    """Return, of every frame with one marker, how far it is off (metres), its confidence and its factors by fusion."""
+def measure(scenes: int) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Return what every detection does, and which frames have lanes that enter Eq. (3).
+
+    Returns:
+        Of every frame with one marker, how far it is off (metres), its confidence and its factors by fusion; and for
+        each row of the second table whether lanes enter, frame by frame.
+    """
     source = load_config(str(CONFIG)).data.source("test")
     assert isinstance(source, ProceduralConfig)
     assert source.example.markers is not None
@@ -73,12 +92,15 @@ def measure(scenes: int) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]
         ProceduralDataset(dataclasses.replace(source, scenes=scenes, example=each)) for each in (example, exact)
     )
     off, trust = [], []
-    following = {name: _Factor(config) for name, config in FUSIONS.items()}
+    following = {name: _Factor(config) for name, config in (FUSIONS | ENTERING).items()}
     factors: dict[str, list[float]] = {name: [] for name in FUSIONS}
+    enters: dict[str, list[bool]] = {name: [] for name in ENTERING}
     for index in range(len(noisy)):
         frame = noisy.example(index)
         found, truth = frame.markers, right.example(index).markers
         now = {name: factor.of(frame) for name, factor in following.items()}
+        for name, frames in enters.items():
+            frames.append(now[name][1] > 0.0)
         if found is None or truth is None or found.valid.sum() != 1 or not found.lane_valid.any():
             continue
         for seen, true in np.argwhere(
@@ -88,15 +110,16 @@ def measure(scenes: int) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]
             off.append(np.linalg.norm((moved - _GROUND)[:, :2], axis=-1).mean())
             distance = np.linalg.norm(found.pose[seen][None, :2, 3], axis=-1)
             trust.append(float(confidence(distance, found.residual[seen][None], MarkerPriorConfig())[0]))
-            for name, value in now.items():
-                factors[name].append(value)
-    return np.array(off), np.array(trust), {name: np.array(values) for name, values in factors.items()}
+            for name, values in factors.items():
+                values.append(now[name][0])
+    by_fusion, by_row = ({name: np.array(v) for name, v in each.items()} for each in (factors, enters))
+    return np.array(off), np.array(trust), by_fusion, by_row
 
 
 def main() -> None:
     """Parse the command line, measure and print."""
     parser = command_line(__doc__, out=None, scenes=40)
-    off, trust, factors = measure(parser.parse_args().scenes)
+    off, trust, factors, enters = measure(parser.parse_args().scenes)
     rows = []
     for low, high in itertools.pairwise(_EDGES):
         inside = (off >= low) & (off < high)
@@ -105,6 +128,8 @@ def main() -> None:
         rows.append([f"{low:g} to {high:g} m", f"{inside.sum()}", mean, *entering])
     print(f"{len(off)} detections, in the middle {np.median(off):.2f} m off\n")
     print(markdown_table(["off by", "detections", "mean confidence", *factors], rows))
+    counted = [[name, f"{frames.sum()}", f"{len(frames)}"] for name, frames in enters.items()]
+    print("\n" + markdown_table(["lanes enter Eq. (3)", "frames", "of"], counted))
 
 
 if __name__ == "__main__":

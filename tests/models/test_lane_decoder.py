@@ -20,6 +20,7 @@ from tflane_jax.models.lane_decoder import (
     directions,
     next_reference,
     smooth_basis,
+    spread_points,
 )
 from tflane_jax.models.lane_queries import spread_lanes
 
@@ -38,6 +39,10 @@ def test_initial_anchors_lie_as_in_scipys_halton_sequence():
     sample = qmc.Halton(3, scramble=False).random(config.queries + 1)[1:]
     middle = spread_lanes(config.queries, config.points, RANGE, length=0.0)[:, 0, :2]
     np.testing.assert_allclose(middle, np.clip(sample[:, :2], 0.02, 0.98), atol=1e-6)
+
+
+def test_heads_look_along_the_whole_lane_and_a_single_one_at_its_middle():
+    assert [spread_points(11, heads).tolist() for heads in (1, 2, 3)] == [[5], [0, 10], [0, 5, 10]]
 
 
 def test_basis_bends_rather_than_zigzags():

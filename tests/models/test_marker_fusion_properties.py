@@ -18,10 +18,8 @@ from tests.shared import assert_same
 from tests.slow import with_slow
 from tflane_jax.geometry import BevGrid, relative_pose, yaw_pose
 from tflane_jax.models.marker_fusion import (
-    FusedMarkers,
     MarkerFusionConfig,
     MarkerPrior,
-    MarkerTokens,
     as_fused,
     as_written,
     fusion_gate,
@@ -59,10 +57,9 @@ class OneLayer(nn.Module):
 
     @nn.compact
     def __call__(self, lanes: MarkerGuidance):
-        tokens = MarkerTokens(self.config, HOST.bev_range, name="tokens")(lanes)
-        fused = FusedMarkers(tokens, lanes, *fusion_gate(lanes, self.config))
+        prior = MarkerPrior(self.config, HOST)
         cells = BevCells(BEV, POSITION, CENTERS, BevGrid(HOST.bev_range, 3, 4))
-        return MarkerPrior(self.config, HOST).into_bev(fused, 0, cells)
+        return prior.into_bev(prior.encode(lanes, deterministic=True), 0, cells)
 
 
 def lanes_of(config, markers):
@@ -152,6 +149,18 @@ def test_a_marker_at_the_threshold_is_used():
     for trust, used in ((0.5, lanes.valid), (0.49, jnp.zeros_like(lanes.valid))):
         equal = lanes.replace(confidence=jnp.where(lanes.valid, trust, 0.0))
         np.testing.assert_array_equal(fusion_gate(equal, hard)[1], used)
+
+
+@pytest.mark.parametrize("attend", ["points", "lines"])
+def test_lanes_of_an_ignored_marker_change_nothing(attend):
+    """Regression: with attention between lines, they changed the tokens of the others."""
+    config = replace(CONFIG, fusion="hard", lines=replace(CONFIG.lines, attend=attend))
+    module, lanes = OneLayer(config), lanes_of(config, observed())
+    fuse = jax.jit(partial(module.apply, random_params(module.init, lanes)))
+    doubtful = lanes.replace(confidence=lanes.confidence.at[1].set(0.1))
+    moved = doubtful.replace(points=doubtful.points.at[1].add(30.0))
+    assert_same(fuse(moved), fuse(doubtful))
+    assert not np.array_equal(fuse(lanes.replace(points=moved.points)), fuse(lanes))
 
 
 @pytest.mark.parametrize("name", ["gated", "ungated", "hard"])

@@ -4,9 +4,10 @@ import dataclasses
 
 import pytest
 
-from tests.models.cases import BASELINE, CAMERA_TOPONET, LIFTED_LINES, SEGMENTS
-from tflane_jax.limits import SettingError
+from tests.models.cases import BASELINE, CAMERA_TOPONET, LIFTED_LINES, SEGMENTS, WITH_TRAFFIC
+from tflane_jax.limits import SettingError, check_settings
 from tflane_jax.models.area_decoder import AreaDecoderConfig
+from tflane_jax.models.bev_encoder import SMALL_BEVFORMER
 from tflane_jax.models.maptr import MapTrConfig
 
 
@@ -20,6 +21,7 @@ BUCKET = dataclasses.replace(
     SEGMENTS, decoder=dataclasses.replace(SEGMENTS.decoder, classes=1), areas=AreaDecoderConfig(dim=16, heads=2)
 )
 CASES = [
+    (WITH_TRAFFIC, "priors.traffic_flow.module.fusions", ("L->L", "T->T"), "such that L->T is among them"),
     (BASELINE, "encoder.dim", 12, "a multiple of 8"),
     (BASELINE, "encoder.levels", (16, 12), "multiples of 8"),
     (CAMERA_TOPONET, "elements.dim", 32, r"encoder\.images\.pyramid\.dim \(16\)"),
@@ -51,6 +53,13 @@ def test_only_lane_segments_need_a_multiple_of_eight_sampling_points(config):
     changed(config, "decoder.sampling_points", 12).build()
     with pytest.raises(SettingError, match=r"^decoder.sampling_points is 12: it must be a multiple of 8 or less"):
         changed(SEGMENTS, "decoder.sampling_points", 12).build()
+
+
+def test_a_kernel_of_cells_has_a_middle():
+    kernel = dataclasses.replace(SMALL_BEVFORMER, attention="kernel", levels=1)
+    check_settings(kernel)
+    with pytest.raises(SettingError, match=r"^kernel is .*: it must be of odd numbers"):
+        check_settings(dataclasses.replace(kernel, kernel=(2, 3)))
 
 
 def test_channels_of_the_lift_encode_positions():

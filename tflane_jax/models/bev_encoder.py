@@ -107,6 +107,7 @@ class BevFormerConfig:
         if self.attention == "kernel":
             yield splits("anchors", self.anchors, "dim", self.dim)
             yield "levels", self.levels == 1, "1 with the geometry-guided kernel (attention)"
+            yield "kernel", all(size % 2 for size in self.kernel), "of odd numbers: a cell is in its middle"
         else:
             multiple = self.spatial_points % self.anchors == 0
             yield "spatial_points", multiple, f"a multiple of anchors ({self.anchors})"

@@ -335,8 +335,12 @@ def attention_reference(reference: Float[Array, "q p 3"], config: LaneDecoderCon
     """Return the reference points of the heads: a common one ("fixed"), or one per head, spread along the lane."""
     if config.refine == "fixed":
         return reference[:, :1, :2]
-    along = np.linspace(0, config.points - 1, config.heads).round().astype(int)
-    return reference[:, along, :2]
+    return reference[:, spread_points(config.points, config.heads), :2]
+
+
+def spread_points(points: int, count: int) -> np.ndarray:
+    """Return the indices of `count` of a line's points, spread from end to end; a single one is in the middle."""
+    return np.linspace(0, points - 1, count).round().astype(int) if count > 1 else np.array([points // 2])
 
 
 def next_reference(

@@ -13,13 +13,12 @@ from typing import Annotated, Literal, NamedTuple
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.layers.initial import uniform_by_fan_in
 from tflane_jax.limits import Count, Limit, Rules, counted
-from tflane_jax.models.lane_decoder import clipped, directions, refined_points, smooth_basis
+from tflane_jax.models.lane_decoder import clipped, directions, refined_points, smooth_basis, spread_points
 from tflane_jax.models.lane_queries import LaneDecoderConfig
 
 LINE_TYPES = 3
@@ -148,7 +147,7 @@ def regions(
     left: Float[Array, "q p 3"], right: Float[Array, "q p 3"], config: SegmentDecoderConfig
 ) -> Float[Array, "q r 2"]:
     """Return the reference point (x, y) of each head: half of the heads along either boundary."""
-    along = np.linspace(0, config.points - 1, config.heads // 2).round().astype(int)
+    along = spread_points(config.points, config.heads // 2)
     return jnp.concatenate([left[:, along, :2], right[:, along, :2]], 1)
 
 

@@ -166,8 +166,9 @@ class MarkerPrior(Prior):
 
     def encode(self, observation: MarkerGuidance, *, deterministic: bool) -> FusedMarkers:
         """Return the lanes' tokens with the gate and mask of the variant (Table II)."""
-        tokens = self.marker_tokens(observation, deterministic=deterministic)
-        return FusedMarkers(tokens, observation, *fusion_gate(observation, self.config))
+        gate, valid = fusion_gate(observation, self.config)
+        tokens = self.marker_tokens(replace(observation, valid=valid), deterministic=deterministic)
+        return FusedMarkers(tokens, observation, gate, valid)
 
     def into_bev(self, tokens: FusedMarkers, layer: int, cells: BevCells) -> Float[Array, "q c"]:
         """Return Eq. (3), after the lanes were written into their cells if `MarkerFusionConfig.bev` is set."""

@@ -23,7 +23,7 @@ from tflane_jax.layers.graph import Mlp
 from tflane_jax.layers.masks import SpatialMask
 from tflane_jax.layers.positions import sine_encoding
 from tflane_jax.layers.precision import Precision, run_layer, run_part
-from tflane_jax.limits import DIFFERENT, NOT_EMPTY, Count, CountOrZero, Rules, check_settings, splits
+from tflane_jax.limits import DIFFERENT, Count, CountOrZero, Rules, check_settings, splits
 from tflane_jax.models.prior import BevCells, HostQueries, HostSpec, Prior
 from tflane_jax.models.raster_fusion import RasterFusion, TrafficRasterConfig
 from tflane_jax.models.traffic_masks import TrafficMaskConfig, sees_any, spatial_mask, temporal_mask
@@ -44,7 +44,7 @@ class TrafficFlowModuleConfig:
     """Shape of the TFM; the defaults are the paper's best (Table 5, Abla5: LT/LL, depth 1, normalised coordinates).
 
     Attributes:
-        fusions: which of the four fusion modules are used, "Pipe." in Table 5: `ALL_FUSIONS` or `LANE_FUSIONS`.
+        fusions: the fusion modules that are used, "Pipe." in Table 5, such as `ALL_FUSIONS`; L->T is always among them.
         depth: temporal self-attention layers, "Dep." in Table 5 as we read it.
         spatial_depth: how often the spatial encoder repeats the fusion modules, each time with separate parameters;
             Eq. (3) follows once. The other reading of "Dep.", because the text names cross-attention layers.
@@ -58,12 +58,12 @@ class TrafficFlowModuleConfig:
         width: channels inside the temporal encoder.
         heads: attention heads in both encoders.
         masking: restrictions of the masks.
-        precision: dtype of linear layers, see `layers.precision`; parameters and results are float32.
+        precision: dtype of layers behind the embeddings, see `layers.precision`; parameters and results are float32.
         remat: recompute the activations of each temporal layer and of the spatial encoder for the gradient instead of
             keeping them.
     """
 
-    fusions: Annotated[tuple[Fusion, ...], NOT_EMPTY, DIFFERENT] = LANE_FUSIONS
+    fusions: Annotated[tuple[Fusion, ...], DIFFERENT] = LANE_FUSIONS
     depth: CountOrZero = 1
     spatial_depth: Count = 1
     residual: Literal["fusion", "none"] = "fusion"
@@ -77,11 +77,11 @@ class TrafficFlowModuleConfig:
     remat: bool = False
 
     def limits(self) -> Rules:
-        """Channels split over heads, each head has its window, and a joint softmax all or none of the T modules."""
+        """Lanes read traffic, channels split over heads, each of which has its window; modules of a joint softmax."""
         yield splits("heads", self.heads, "width", self.width)
-        known = set(self.fusions) in (set(LANE_FUSIONS), set(ALL_FUSIONS))
-        joint = self.masking.softmax == "joint"
-        yield "fusions", known or not joint, "L->T and L->L, or all four, where masking.softmax is joint"
+        yield "fusions", "L->T" in self.fusions, "such that L->T is among them, by which lanes read traffic"
+        together = self.masking.softmax != "joint" or set(self.fusions) in (set(LANE_FUSIONS), set(ALL_FUSIONS))
+        yield "fusions", together, "L->T and L->L, or all four, where masking.softmax is joint"
         fits = len(self.masking.head_windows) in (0, self.heads)
         yield "masking.head_windows", fits, f"one window for each of the {self.heads} heads, or ()"
 

@@ -22,7 +22,7 @@ from tflane_jax.ablations.effects import SAMPLES, Untested, effects, judged_clai
 from tflane_jax.ablations.findings import findings, sentence
 from tflane_jax.ablations.recorded import Measured
 from tflane_jax.ablations.results import Results
-from tflane_jax.ablations.statistics import holm, paired_difference
+from tflane_jax.ablations.statistics import holm, nothing_drawn, paired_difference
 from tflane_jax.errors import UserError
 from tflane_jax.evaluation.by_scene import scene_weights
 from tflane_jax.evaluation.results import SceneRatio, SceneSamples
@@ -137,10 +137,8 @@ def test_an_effect_of_few_scenes_is_not_shown():
 def test_one_seed_tests_nothing():
     found = Results(("baseline", "+TFM"), range(1), {})
     for model, hits in (("baseline", (5, 5, 5)), ("+TFM", (7, 8, 9))):
-        measured = Measured(
-            1, "a protocol", {"": {PRIMARY: sum(hits) / 30}}, {"": {PRIMARY: SceneRatio(hits, (10, 10, 10))}}
-        )
-        found.add("", "last", model, 0, measured)
+        ratio = {"": {PRIMARY: SceneRatio(hits, (10, 10, 10))}}
+        found.add("", "last", model, 0, Measured(1, "a protocol", {"": {PRIMARY: sum(hits) / 30}}, ratio))
     (effect,) = effects(found, Declaration(PRIMARY, (Claim("+TFM", text="it helps"),)), "", "last")
     assert effect.low > 0
     assert effect.finding == "not tested"
@@ -196,6 +194,14 @@ def test_a_ratio_and_a_ranked_score_are_drawn_alike():
     effect = effects(found, declaration, "", "last")[-1]
     assert effect.measure == DIFFERENCE
     assert (effect.low, effect.high) == (pytest.approx(0.2), pytest.approx(0.2))  # recall is the same in every sample
+
+
+def test_samples_without_lanes_of_the_group_are_no_draws():
+    lanes = (9, 0, 0, 9)
+    empty = nothing_drawn(lanes, scene_weights(4, 400))  # by convention both rows have 1 there
+    found = of_pairs([ranked(np.where(empty, 1.0, value), lanes=lanes) for value in (0.4, 0.6)])
+    (effect,) = effects(found, Declaration("all/mAP", (Claim("+TFM"),)), "", "last")
+    assert (effect.low, effect.high) == (pytest.approx(0.2), pytest.approx(0.2))
 
 
 def test_a_row_measured_by_an_earlier_program_takes_the_interval_away():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from tflane_jax.ablations.statistics import holm, interval, paired_difference, resampled_ratio
+from tflane_jax.ablations.statistics import holm, interval, nothing_drawn, paired_difference, resampled_ratio
 from tflane_jax.evaluation.by_scene import scene_weights
 
 
@@ -96,6 +96,22 @@ def test_resampled_ratios_against_a_loop_over_drawn_scenes():
     # Every scene once: the ratio itself.
     whole = resampled_ratio(found, lanes, np.ones((1, 12), int))
     np.testing.assert_allclose(whole, found.sum() / 3 / lanes.sum())
+
+
+def test_samples_without_anything_to_count_say_nothing():
+    """Regression: recall 0 and, by the official convention, DET_l 1 counted as draws of the score."""
+    lanes, none = np.array([3, 0, 0, 1, 0]), np.zeros(5, int)
+    weights = scene_weights(5, 400)
+    empty = nothing_drawn(lanes, weights)
+    assert 15 < empty.sum() < 50  # (3/5)^5 of them
+    samples = resampled_ratio(np.array([[2, 0, 0, 1, 0]]), lanes, weights)
+    assert np.isnan(samples).tolist() == empty.tolist()
+    assert interval(samples) == pytest.approx((2 / 3, 1.0))
+    # All that tells how little one scene says.
+    assert interval(resampled_ratio(np.array([[2, 0, 0, 0, 0]]), np.array([3, 0, 0, 0, 0]), weights))[0] == 0.0
+    assert not nothing_drawn(none, weights).any()
+    assert not resampled_ratio(none[None], none, weights).any()
+    assert all(map(math.isnan, interval(np.full(3, np.nan))))
 
 
 def test_the_interval_of_a_mean_has_the_width_that_theory_gives():

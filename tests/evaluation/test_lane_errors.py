@@ -72,6 +72,7 @@ def test_oncoming_and_crossing_lanes_cover_nothing():
 def test_lines_without_length_and_empty_frames():
     point = np.ones((1, 11, 3))
     assert covered_fraction(point, point) == covered_fraction(lanes(line(0, 3)), point) == [0.0]
+    assert covered_fraction(point, lanes(line(0, 3))) == [0.0]  # beside it, but in no direction
     assert covered_fraction(lanes(), point).shape == (0,)
     errors = count_errors([scene([], [line(0, 9)], [0.9]), scene([line(0, 9)], [], [])])
     assert np.isinf(errors.threshold)

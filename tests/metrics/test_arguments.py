@@ -1,5 +1,7 @@
 """Arguments of metrics that are none of those allowed are named, instead of measuring by another protocol."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -9,6 +11,7 @@ from tflane_jax.metrics.frames import LaneDetections, LaneTruth
 from tflane_jax.metrics.groups import GroupedMetrics
 from tflane_jax.metrics.lane_segment import LaneSegmentMetrics
 from tflane_jax.metrics.openlane_v2 import CenterlineMetrics
+from tflane_jax.metrics.partitions import ByDistance
 from tflane_jax.metrics.vector_map import VectorMapMetrics
 
 LANES = np.stack([np.linspace([0, y, 0], [30, y, 0], 11) for y in (0.0, 5.0)])
@@ -30,6 +33,9 @@ def grouped(**further):
         (lambda: VectorMapMetrics("MapTRv2"), "sampling is 'MapTRv2': it must be 'maptr' or"),
         (lambda: VectorMapMetrics(measure="Chamfer"), "measure is 'Chamfer'"),
         (lambda: VectorMapMetrics(dims=4), "dims is 4"),
+        (lambda: grouped(groups=("all", "visible")), "groups names 'visible': give a list of all, occluded, clear"),
+        (lambda: grouped(groups="occluded"), "groups names 'occluded': give a list"),
+        (lambda: ByDistance((20.0, 10.0)), r"are \(20.0, 10.0\): give metres above 0 in ascending order"),
         (lambda: grouped(frame_groups=("all",)), "two groups are called all"),
         (lambda: grouped(lane_groups=("own",), frame_groups=("own",)), "two groups are called own"),
     ],
@@ -61,6 +67,17 @@ def test_an_unknown_group_of_frames_is_refused():
     metrics = grouped(frame_groups=("rain",))
     with pytest.raises(UserError, match="there is no group of frames 'rian', only rain"):
         metrics.update(*lanes(), frame_group="rian")
+
+
+def test_a_refused_frame_changes_nothing():
+    """Regression: `all` counted it, and the groups no longer had the same frames."""
+    metrics, (detections, truth) = grouped(), lanes()
+    metrics.update(detections, truth)
+    before = metrics.compute()
+    with pytest.raises(UserError, match="no visibility"):
+        metrics.update(detections, dataclasses.replace(truth, visibility=None))
+    assert metrics.compute() == before
+    assert metrics.bootstrap(np.ones((3, 1), int))["clear"]["DET_l"].tolist() == [1.0] * 3
 
 
 @pytest.mark.parametrize("value", [0.3, -1, 2])

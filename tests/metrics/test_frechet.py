@@ -31,6 +31,16 @@ def test_padding_by_the_last_vertex_keeps_the_distance(seed, counts):
     np.testing.assert_allclose(pair_frechet(padded, padded, i, j), all_pairs(frechet, lines, lines).ravel(), rtol=1e-14)
 
 
+def test_pairs_in_parts(monkeypatch):
+    rng = np.random.default_rng(0)
+    a, b = rng.uniform(-5, 5, (6, 4, 3)), rng.uniform(-5, 5, (7, 5, 3))
+    i, j = np.indices((6, 7)).reshape(2, -1)
+    at_once = pair_frechet(a, b, i, j)
+    for block in (1, 100, 4 * 5 * 21):
+        monkeypatch.setattr("tflane_jax.metrics.frechet._BLOCK", block)
+        np.testing.assert_array_equal(pair_frechet(a, b, i, j), at_once)
+
+
 def test_by_hand():
     a = np.array([[(0, 0), (1, 0), (2, 0), (3, 0)]], float)
     b = np.array([[(0, 1), (3, 1)]], float)

@@ -14,8 +14,8 @@ from tests.metrics.segments import evaluate, frame, moved, random_segments, with
 from tflane_jax.errors import UserError
 from tflane_jax.metrics import GroupedMetrics, LaneDetections
 from tflane_jax.metrics.centerline_matching import LANE_THRESHOLDS
-from tflane_jax.metrics.groups import ByDistance, ByOcclusion
 from tflane_jax.metrics.lane_segment import LaneSegmentMetrics
+from tflane_jax.metrics.partitions import ByDistance, ByOcclusion
 from tflane_jax.metrics.segment_matching import (
     AREA_THRESHOLDS,
     AreaTruth,

@@ -1,14 +1,29 @@
 """Accumulators of many scenes joined at once, against one after the other; what they keep, bit for bit."""
 
 import functools
+from functools import partial
 
 import numpy as np
 import pytest
 
 from tests.metrics.test_bootstrap import centerlines, lines, segments
-from tflane_jax.metrics import CenterlineFScore, CenterlineMetrics, LaneSegmentMetrics, VectorMapMetrics
+from tflane_jax.files.tusimple import RowLanes
+from tflane_jax.metrics import (
+    CenterlineFScore,
+    CenterlineMetrics,
+    GroupedMetrics,
+    LaneSegmentMetrics,
+    TuSimpleMetrics,
+    VectorMapMetrics,
+)
 from tflane_jax.metrics.matching import average_precision_11, average_precision_area, ranked
 from tflane_jax.metrics.merging import by_frame, joined
+
+
+def rows(number):
+    """Return detections and truth of an image."""
+    rng = np.random.default_rng(number)
+    return tuple(RowLanes(rng.uniform(0, 60, (count, 5)), np.arange(5)) for count in (3, 4))
 
 
 def test_joined():
@@ -34,7 +49,10 @@ def test_arrays_of_frames(shape):
         (CenterlineFScore, centerlines),
         (LaneSegmentMetrics, segments),
         (VectorMapMetrics, lines),
+        (TuSimpleMetrics, rows),
+        (partial(GroupedMetrics, LaneSegmentMetrics, ("all",)), segments),
     ],
+    ids=["centerlines", "f_score", "segments", "lines", "tusimple", "groups"],
 )
 def test_many_at_once_are_as_one_after_the_other(make, frame):
     parts = [make() for _ in range(6)]
@@ -43,7 +61,11 @@ def test_many_at_once_are_as_one_after_the_other(make, frame):
     first, *others = (parts[i] for i in (4, 0, 0, 5, 2, 1))
     before = first.compute()
     assert first.merge(*others).compute() == functools.reduce(lambda a, b: a.merge(b), others, first).compute()
-    assert first.merge().compute() == first.compute() == before
+    alone = first.merge()
+    assert alone.compute() == first.compute() == before
+    alone.update(*frame(3))
+    assert alone.compute() != before
+    assert first.compute() == before
 
 
 def test_ranked_detections_keep_the_order_of_equal_scores():

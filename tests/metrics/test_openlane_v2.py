@@ -14,7 +14,7 @@ from tests.metrics.fixtures import expected_cases, load_frames
 from tflane_jax.errors import UserError
 from tflane_jax.metrics import CenterlineMetrics, GroupedMetrics, LaneDetections, LaneTruth
 from tflane_jax.metrics.centerline_matching import LANE_THRESHOLDS, iou_distance, match_frame, nearest_lanes
-from tflane_jax.metrics.groups import ByOcclusion
+from tflane_jax.metrics.partitions import ByOcclusion
 
 VERSIONS = {"v2.1": "", "v1.0": "v1_0_"}
 CASES = list(expected_cases())

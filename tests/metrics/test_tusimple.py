@@ -150,6 +150,7 @@ def test_merged_accumulators_equal_one_pass():
     [
         (np.zeros((2, 9)), upright(1), ROWS, r"detections: lanes have shape \(2, 9\), expected \(lanes, 10\)"),
         (upright(1), np.zeros(10), ROWS, r"truth: lanes have shape \(10,\)"),
+        ([[1.0] * 10, [1.0] * 9], upright(1), ROWS, "detections: lanes have different numbers of rows, expected 10"),
         (np.array([[np.nan] * 10]), upright(1), ROWS, "detections: lane 0 has a number that is not finite"),
         (upright(1), upright(1), None, "h_samples"),
     ],

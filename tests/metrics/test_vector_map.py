@@ -156,6 +156,16 @@ def test_a_class_that_a_part_lacks_does_not_count_there():
         assert all(result[part][name] == 1.0 for name in names)
 
 
+def test_the_group_of_a_detection_depends_on_no_other_line():
+    """Regression: with `as_given`, a longer line of another class changed which line is the nearest."""
+    true = [line(0.0), line(0, (30.0, 40.0))]
+    long = line(50.0, np.linspace(0.0, 10.0, 150))
+    for found, classes in (([line(9.0, (3.0, 24.0))], [0]), ([line(9.0, (3.0, 24.0)), long], [0, 2])):
+        detections, truth = frame(true, found, [0.9] * len(found), ([0, 0], classes))
+        for sampling in KEYS:
+            assert match_map(detections, truth, sampling, nearest="all").nearest[0] == 0
+
+
 def test_classes_do_not_mix():
     result = evaluate([frame([line(0), line(0)], [line(0), line(0)], [0.9, 0.8], ([0, 2], [2, 1]))])
     assert (result["AP_divider"], result["AP_ped_crossing"], result["AP_boundary"]) == (0.0, 0.0, 1.0)

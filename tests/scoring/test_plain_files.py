@@ -11,7 +11,7 @@ from tests.metrics.cases import hand_frame, random_frame
 from tflane_jax.cli import main
 from tflane_jax.errors import UserError
 from tflane_jax.metrics import CenterlineMetrics, GroupedMetrics
-from tflane_jax.metrics.groups import ByDistance
+from tflane_jax.metrics.partitions import ByDistance
 from tflane_jax.scoring.plain import read_predictions
 
 PROTOCOL = "openlane-v2.1-centerline"

@@ -26,7 +26,7 @@ from tflane_jax.ablations.declaration import Claim, Declaration
 from tflane_jax.ablations.recorded import Which
 from tflane_jax.ablations.results import Results
 from tflane_jax.ablations.scores import CHECKPOINTS
-from tflane_jax.ablations.statistics import holm, interval, paired_difference, resampled_ratio
+from tflane_jax.ablations.statistics import holm, interval, nothing_drawn, paired_difference, resampled_ratio
 from tflane_jax.errors import UserError
 from tflane_jax.evaluation.by_scene import scene_weights
 from tflane_jax.evaluation.results import SceneRatio, SceneSamples
@@ -288,7 +288,10 @@ def _samples(
 
 
 def _of_score(found: Mapping[str, Sequence[Any]], score: str, count: int) -> dict[str, Float[np.ndarray, " b"]]:
-    """Return as many bootstrap samples of a score for each row, the seeds averaged, from its parts for each seed."""
+    """Return as many bootstrap samples of a score for each row, the seeds averaged, from its parts for each seed.
+
+    NaN where a sample has no lanes of the score's group, see `nothing_drawn`.
+    """
     (first, (one, *_)), *_ = found.items()
     lanes = one.lanes if isinstance(one, SceneSamples) else one.denominator
     for row, each in found.items():
@@ -298,7 +301,9 @@ def _of_score(found: Mapping[str, Sequence[Any]], score: str, count: int) -> dic
                 "an earlier state of the code measured, saw other test data; train and measure it again"
             )
     if isinstance(one, SceneSamples):
-        return {row: np.mean([part.values for part in each], axis=0) for row, each in found.items()}
+        empty = nothing_drawn(lanes, scene_weights(len(lanes), len(one.values)))
+        means = {row: np.mean([part.values for part in each], axis=0) for row, each in found.items()}
+        return {row: np.where(empty, np.nan, mean) for row, mean in means.items()}
     weights = scene_weights(len(lanes), count)
     return {
         row: resampled_ratio(np.array([part.numerator for part in each]), np.array(lanes), weights)

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
+from numpy.typing import ArrayLike
 
 _ROUNDING = 1e-12  # of scores: 0.5 - 0.4 and 0.8 - 0.7 differ by 1e-16
 
@@ -96,13 +97,31 @@ def resampled_ratio(
         weights: how often each scene is drawn, see `evaluation.by_scene`.
 
     Returns:
-        Ratios; 0 where a sample has nothing to count.
+        Ratios; NaN where `nothing_drawn`, 0 where no scene has anything to count.
     """
     total = weights @ np.asarray(denominator)
-    return weights @ np.asarray(numerators).mean(0) / np.maximum(total, 1)
+    ratios = weights @ np.asarray(numerators).mean(0) / np.maximum(total, 1)
+    return np.where(nothing_drawn(denominator, weights), np.nan, ratios)
+
+
+def nothing_drawn(counted: ArrayLike, weights: Int[np.ndarray, "b c"]) -> Bool[np.ndarray, " b"]:
+    """Return which bootstrap samples hold none of what is counted in the scenes, although several scenes have it.
+
+    What a score is by convention where there is nothing to find, 0 or 1, would say nothing about its uncertainty. Where
+    a single scene has it, such samples stay: the others are all alike, and would make one scene look certain.
+
+    Args:
+        counted: of each scene, such as its number of lanes of a group.
+        weights: how often each scene is drawn.
+    """
+    counted = np.asarray(counted)
+    return (weights @ counted == 0) & (np.count_nonzero(counted) > 1)
 
 
 def interval(samples: Float[np.ndarray, " b"], level: float = 0.95) -> tuple[float, float]:
-    """Return the percentile interval of bootstrap samples."""
+    """Return the percentile interval of bootstrap samples; those that are NaN do not count. NaN without any."""
+    samples = samples[~np.isnan(samples)]
+    if len(samples) == 0:
+        return math.nan, math.nan
     low, high = np.quantile(samples, [(1 - level) / 2, (1 + level) / 2])
     return float(low), float(high)

@@ -163,5 +163,5 @@ def covered_fraction(lines: Float[np.ndarray, "g n 3"], others: Float[np.ndarray
     near = np.linalg.norm(away - along[..., None] * step, axis=-1) <= WITHIN
     size = np.linalg.norm(steps, axis=-1)[..., None] * length
     same = np.einsum("gsd,md->gsm", steps, step) >= np.cos(HEADING) * size
-    # A piece without a length has no direction.
-    return (near & same & (length > 0.0)).any(-1).mean(-1)
+    # A piece without a length has no direction, on either side.
+    return (near & same & (size > 0.0)).any(-1).mean(-1)

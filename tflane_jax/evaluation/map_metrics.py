@@ -14,8 +14,9 @@ from tflane_jax.evaluation.line_tracks import LineTracks
 from tflane_jax.evaluation.vector_maps import detections_of_lines, truth_of_lines, truth_of_segment_lines
 from tflane_jax.metrics.bootstrap import Weights
 from tflane_jax.metrics.consistency import CONFIDENT, MapConsistency
-from tflane_jax.metrics.groups import BY_OCCLUSION, FrameGroup, GroupedMetrics
+from tflane_jax.metrics.groups import FrameGroup, GroupedMetrics
 from tflane_jax.metrics.map_matching import Dims, MatchedMap, Measure, match_map
+from tflane_jax.metrics.partitions import BY_OCCLUSION
 from tflane_jax.metrics.vector_map import VectorMapMetrics
 from tflane_jax.scene import Example, LinePrediction
 

@@ -9,6 +9,9 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float, Int
 
+# Squared distances of vertices that are in memory at a time, several times over.
+_BLOCK = 2**21
+
 
 def end_distance(a: Float[np.ndarray, "a n d"], b: Float[np.ndarray, "b m d"]) -> Float[np.ndarray, "a b"]:
     """Return for all pairs the larger of the distances of first and of last vertices.
@@ -31,14 +34,25 @@ def pair_frechet(
 
     Directional; lines padded by repeating their last vertex keep their distances.
     """
-    n, m = a.shape[1], b.shape[1]
+    size = max(_BLOCK // (a.shape[1] * b.shape[1]), 1)
+    if len(i) <= size:
+        return _distances(a[i], b[j])
+    starts = range(0, len(i), size)
+    return np.concatenate([_distances(a[i[s : s + size]], b[j[s : s + size]]) for s in starts])
+
+
+def _distances(a: Float[np.ndarray, "k n d"], b: Float[np.ndarray, "k m d"]) -> Float[np.ndarray, " k"]:
+    """Return the distances of lines that are pairs."""
+    pairs, n, m = len(a), a.shape[1], b.shape[1]
+    cells = np.zeros((n, m, pairs))
     # Vertices come first, so that every step works on contiguous arrays over all pairs.
-    step = a[i].transpose(2, 1, 0)[:, :, None] - b[j].transpose(2, 1, 0)[:, None]
-    cells = (step**2).sum(0).reshape(n * m, len(i))
+    for first, second in zip(a.transpose(2, 1, 0), b.transpose(2, 1, 0), strict=True):
+        cells += (first[:, None] - second) ** 2
+    cells = cells.reshape(n * m, pairs)
     if n == 1 or m == 1:
         return np.sqrt(cells.max(0))
     # The least cost to reach the cells (row, diagonal - row) of the last two diagonals, by row; inf where none was yet.
-    before, last = (np.full((n + 1, len(i)), np.inf) for _ in range(2))
+    before, last = (np.full((n + 1, pairs), np.inf) for _ in range(2))
     last[1] = cells[0]
     for diagonal in range(1, n + m - 1):
         low, high = max(0, diagonal - m + 1), min(diagonal, n - 1)

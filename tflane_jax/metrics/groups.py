@@ -4,20 +4,19 @@ Every frame is matched once, with all lanes and all detections, by the official 
 
 - average precisions count the true lanes in S and the detections whose nearest true lane lies in S, false positives
   included. Nearest is by the metric's distance, however large; below the largest threshold it is the official
-  candidate. Detections in frames without true lanes count only in `all`;
+  candidate. Detections in frames without true lanes, or map lines of their class, count only in `all`;
 - topology scores pool the vertex precisions of the lanes in S; their neighbours may lie outside S.
 
-`all` is the official number. The groups of a partition share its lanes and its vertices, and its detections in frames
-with lanes. Traffic elements and areas count only in `all` and in groups of frames. Published conventions for what the
-truth lacks hold for `all`: in a part of a map, a class without true lines or areas has no average precision.
+`all` is the official number. The groups of a partition (`metrics.partitions`) share its lanes and its vertices, and its
+detections in frames with lanes (of map lines: with lines of the detection's class). Traffic elements and areas count
+only in `all` and in groups of frames. Published conventions for what the truth lacks hold for `all`: in a part of a
+map, a class without true lines or areas has no average precision.
 """
 
 from __future__ import annotations
 
 import copy
-import itertools
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, Literal, Protocol, Self
 
 import numpy as np
@@ -25,8 +24,8 @@ from jaxtyping import Bool, Float, Int
 
 from tflane_jax.errors import UserError
 from tflane_jax.metrics.bootstrap import Weights, checked_weights
-from tflane_jax.metrics.frames import Lines, check_shape
 from tflane_jax.metrics.merging import joined
+from tflane_jax.metrics.partitions import BY_OCCLUSION, Partition, TrueLanes
 
 COUNTS = ("frames", "lanes", "lines")
 """Numbers of a group that are no scores, but what its scores rest on."""
@@ -43,20 +42,6 @@ def shown_of_part(values: Mapping[str, Any]) -> dict[str, Any]:
     if values.get("lanes", values.get("lines")) != 0:
         return dict(values)
     return {name: value for name, value in values.items() if name in COUNTS}
-
-
-class TrueLanes(Protocol):
-    """True lanes of one frame, or lines of a map in their place."""
-
-    @property
-    def points(self) -> Lines:
-        """Polylines, metres."""
-        ...
-
-    @property
-    def visibility(self) -> Any:
-        """Fraction of each in direct line of sight; None if it is not known."""
-        ...
 
 
 class Matched(Protocol):
@@ -110,78 +95,6 @@ class LaneMetrics(Protocol):
         ...
 
 
-class Partition(Protocol):
-    """A division of true lanes into groups, each lane in one."""
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the groups."""
-        ...
-
-    @property
-    def suffix(self) -> str:
-        """What it adds to the name of the protocol."""
-        ...
-
-    def members(self, group: str, truth: TrueLanes) -> Bool[np.ndarray, " g"]:
-        """Return which of the true lanes belong to a group; raise UserError if the truth lacks what decides it."""
-        ...
-
-
-@dataclass(frozen=True)
-class ByOcclusion:
-    """A lane is `occluded` if its visibility (fraction in direct line of sight) is below `below`, else `clear`."""
-
-    below: float = 0.5
-    names = ("occluded", "clear")
-
-    @property
-    def suffix(self) -> str:
-        """What it adds to the name of the protocol."""
-        return f", occluded: visibility < {self.below:g}"
-
-    def members(self, group: str, truth: TrueLanes) -> Bool[np.ndarray, " g"]:
-        """Return which of the true lanes belong to a group; raise UserError if their visibility is not known."""
-        if truth.visibility is None:
-            raise UserError("the truth has no visibility of its lanes: leave out the groups by occlusion")
-        visibility = np.asarray(truth.visibility)
-        check_shape(visibility, (len(truth.points),), "truth: visibility")
-        return (visibility < self.below) == (group == "occluded")
-
-
-BY_OCCLUSION = ByOcclusion()
-
-
-@dataclass(frozen=True)
-class ByDistance:
-    """Lanes by the distance of their nearest vertex in the ground plane.
-
-    Attributes:
-        edges: distances at which one group ends and the next begins, metres, ascending.
-    """
-
-    edges: tuple[float, ...] = (10.0, 20.0, 30.0)
-    suffix = ", by distance of a lane's nearest vertex"
-
-    @property
-    def _ranges(self) -> dict[str, tuple[float, float]]:
-        return {
-            f"from {low:g} m" if high == np.inf else f"{low:g} to {high:g} m": (low, high)
-            for low, high in itertools.pairwise([0.0, *self.edges, np.inf])
-        }
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the groups, nearest first."""
-        return tuple(self._ranges)
-
-    def members(self, group: str, truth: TrueLanes) -> Bool[np.ndarray, " g"]:
-        """Return which of the true lanes belong to a group."""
-        low, high = self._ranges[group]
-        distance = np.array([np.linalg.norm(np.asarray(line)[:, :2], axis=-1).min() for line in truth.points])
-        return (low <= distance) & (distance < high)
-
-
 FrameGroup = str | Sequence[str] | None
 """The groups of frames that a frame belongs to: one, several, or none."""
 
@@ -210,6 +123,9 @@ class GroupedMetrics:
         self._frame_groups = frozenset(frame_groups)
         self._lane_groups = frozenset(lane_groups)
         groups = ("all", *partition.names) if groups is None else groups
+        if isinstance(groups, str) or (unknown := set(groups) - {"all", *partition.names}):
+            asked = groups if isinstance(groups, str) else min(unknown)
+            raise UserError(f"groups names {asked!r}: give a list of {', '.join(('all', *partition.names))}")
         names = ["all", *partition.names, *lane_groups, *frame_groups]
         if twice := {name for name in names if names.count(name) > 1}:
             raise UserError(f"two groups are called {min(twice)}: give the further one another name")
@@ -262,18 +178,26 @@ class GroupedMetrics:
             raise UserError(
                 f"there is no group of frames {min(unknown)!r}, only {', '.join(self._frame_groups) or 'none'}"
             )
+        # All parts first: a frame that is refused changes nothing.
+        parts = {
+            group: self._part(group, frame, truth, own, members)
+            for group in self._metrics
+            if group not in self._frame_groups or group in own
+        }
         for group, metrics in self._metrics.items():
-            lanes = hits = 0
-            self._measures[group].append(group not in self._frame_groups or group in own)
-            if self._measures[group][-1]:
-                part = frame
-                if group in self._lane_groups:
-                    part = frame.select(self._members(group, members, frame.lanes))
-                elif group != "all" and group not in own:
-                    part = frame.select(self.partition.members(group, truth))
+            part = parts.get(group)
+            self._measures[group].append(part is not None)
+            if part is not None:
                 metrics.add(part)
-                lanes, hits = part.lanes, int(part.hits.sum())
-            self._recalled[group].append((lanes, hits))
+            self._recalled[group].append((0, 0) if part is None else (part.lanes, int(part.hits.sum())))
+
+    def _part(
+        self, group: str, frame: Matched, truth: TrueLanes, own: Sequence[str], members: Mapping[str, Any] | None
+    ) -> Matched:
+        """Return the part of a frame that a group measures."""
+        if group in self._lane_groups:
+            return frame.select(self._members(group, members, frame.lanes))
+        return frame if group == "all" or group in own else frame.select(self.partition.members(group, truth))
 
     @staticmethod
     def _members(group: str, members: Mapping[str, Any] | None, lanes: int) -> Bool[np.ndarray, " g"]:

@@ -152,7 +152,8 @@ def match_map(
     hits = np.stack([greedy_match(least <= limit, number, scores) >= 0 for limit in limits])
     if nearest == "all":
         far = least >= 1.0 if measure == "iou" else np.isinf(least)
-        number = _nearest_of_all(true, found, same, far, number)
+        # The lines that are compared, or as many points on each: groups depend on no other line of the frame.
+        number = _nearest_of_all(true, found.resampled(SAMPLES) if sampling == "as_given" else found, same, far, number)
     return MatchedMap(scores, classes, number, least, hits, true_classes)
 
 

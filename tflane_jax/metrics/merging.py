@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import functools
 import itertools
 import operator
@@ -12,10 +13,13 @@ import numpy as np
 
 
 def joined(parts: Sequence[Any]) -> Any:
-    """Return the parts, at least one, as one: lists one after the other, numbers and arrays added up in this order."""
+    """Return the parts, at least one, as one: lists one after the other, numbers and arrays added up in this order.
+
+    What is returned is new: an accumulator adds to its arrays in place.
+    """
     if isinstance(parts[0], list):
         return list(itertools.chain.from_iterable(parts))
-    return functools.reduce(operator.add, parts)
+    return functools.reduce(operator.add, parts) if len(parts) > 1 else copy.copy(parts[0])
 
 
 def by_frame(parts: Sequence[np.ndarray], shape: tuple[int, ...], dtype: type = float) -> np.ndarray:

@@ -14,10 +14,11 @@ from tflane_jax.files import tusimple
 from tflane_jax.files.fields import PICKLE_SUFFIXES
 from tflane_jax.files.openlane import FrameKey
 from tflane_jax.metrics.f_score import CenterlineFScore
-from tflane_jax.metrics.groups import ByDistance, GroupedMetrics, LaneMetrics
+from tflane_jax.metrics.groups import GroupedMetrics, LaneMetrics
 from tflane_jax.metrics.lane_segment import Flavour, LaneSegmentMetrics
 from tflane_jax.metrics.map_matching import LINE_CLASSES, Dims, Measure, Sampling
 from tflane_jax.metrics.openlane_v2 import CenterlineMetrics
+from tflane_jax.metrics.partitions import ByDistance
 from tflane_jax.metrics.topology import Version
 from tflane_jax.metrics.tusimple import LSTR_TIME_LIMIT, OFFICIAL_TIME_LIMIT, TuSimpleMetrics
 from tflane_jax.metrics.vector_map import VectorMapMetrics

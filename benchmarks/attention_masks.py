@@ -17,7 +17,6 @@ the projections leave them (batch, tokens, heads, channels). All results are che
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -39,6 +38,8 @@ from benchmarks.timing import (
     save,
     summarise,
 )
+from benchmarks.torch_fitting import import_torch
+from tflane_jax.errors import UserError
 from tflane_jax.layers.attention import masked_attention
 from tflane_jax.layers.masks import SpatialMask
 
@@ -218,10 +219,9 @@ def with_gradient(function: Callable[[Inputs], Tokens]) -> Callable[[Inputs], tu
 def torch_programs(result: Result, inputs: Inputs) -> dict[str, Compiled]:
     """Return PyTorch's `scaled_dot_product_attention`, forward and with gradient; nothing where torch is missing."""
     try:
-        torch = importlib.import_module("torch")
-    except ImportError:
+        torch = import_torch()
+    except UserError:
         return {}
-    torch.set_num_threads(cores())
     lanes, traffic, gradient = (torch.tensor(np.asarray(x)) for x in (inputs.lanes, inputs.traffic, inputs.gradient))
     mask = spatial_masks(inputs)
     quadrants = {k: None if m is None else torch.tensor(np.asarray(m)) for k, m in quadrants_of(mask).items()}
@@ -313,11 +313,13 @@ def run(
         results: which results to compare.
         seconds: at least that long for each comparison.
     """
-    record = machine() | {"traffic": TRAFFIC, "heads": HEADS, "channels": CHANNELS, "torch": _torch(), "records": []}
+    record: dict[str, Any] = {"traffic": TRAFFIC, "heads": HEADS, "channels": CHANNELS, "torch": _torch()}
+    record["records"] = []
     for result in results:
         for count in lanes:
             for batch in (1, 8) if count <= LARGEST_DENSE else (1,):
                 record["records"] += compare(result, batch, count, seconds)
+    record = machine() | record  # the load is that at the end
     text = table(record["records"])
     print(text)
     save(out, "attention_masks", record, text)
@@ -326,8 +328,8 @@ def run(
 
 def _torch() -> dict[str, Any] | str:
     try:
-        torch = importlib.import_module("torch")
-    except ImportError:
+        torch = import_torch()
+    except UserError:
         return "not installed, left out"
     return {"version": torch.__version__, "threads": cores()}
 

@@ -10,7 +10,6 @@ rounds.
 from __future__ import annotations
 
 import importlib.util
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -83,15 +82,14 @@ def programs(case: Case, *, gradient: bool) -> dict[str, Compiled]:
         return deformable_attention(given[0], case.shapes, given[1], given[2])
 
     def backward(cotangent: jax.Array, *given: jax.Array) -> tuple[jax.Array, ...]:
-        return jax.vjp(attend, *given)[1](cotangent)
+        # The output too: without it XLA leaves the forward pass out, and PyTorch cannot.
+        out, pull = jax.vjp(attend, *given)
+        return out, *pull(cotangent)
 
     given = [jnp.asarray(array) for array in (value, locations, weights)]
     ours = compile_jax(backward, jnp.asarray(cotangent), *given) if gradient else compile_jax(attend, *given)
     if importlib.util.find_spec("torch") is None:
         return {OURS: ours}
-    # Read when PyTorch is imported. Waiting threads that spin would slow down both sides, PyTorch more than ours.
-    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
-    os.environ.setdefault("GOMP_SPINCOUNT", "0")
     from benchmarks.torch_deformable import program
 
     theirs = program(value, case.shapes, locations, weights, cotangent if gradient else None)
@@ -129,7 +127,8 @@ def table(results: dict[str, dict[str, Any]]) -> str:
 def run(out: Path, seconds: float = 10.0) -> None:
     """Measure, print and save."""
     configure_jax(keep_programs=False)  # compiling is timed
-    record = machine() | {"results": measure(seconds)}
+    results = measure(seconds)
+    record = machine() | {"results": results}  # the load is that at the end
     text = table(record["results"])
     print(text)
     save(out, "deformable", record, text)

@@ -16,7 +16,6 @@ from __future__ import annotations
 import argparse
 import json
 import re
-import resource
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -105,10 +104,16 @@ def train(name: str, folder: Path) -> dict[str, Any]:
     return {
         "compile_s": result.compile_seconds,
         "update_s": (seconds[-1] - seconds[0]) / (len(seconds) - 1),  # the first touches fresh memory
-        "peak_gib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20,
+        "peak_gib": _peak_gib(),
         "loss": [record["loss"] for record in records],
         "grad_norm": [record["grad_norm"] for record in records],
     }
+
+
+def _peak_gib() -> float:
+    """Return the most memory that this process has held; `ru_maxrss` would begin with that of the one it came from."""
+    status = Path("/proc/self/status").read_text(encoding="utf-8")
+    return int(next(line.split()[1] for line in status.splitlines() if line.startswith("VmHWM"))) / 2**20
 
 
 def measured(name: str, folder: Path) -> dict[str, Any]:

@@ -45,7 +45,7 @@ def program(
     weights: np.ndarray,
     cotangent: np.ndarray | None = None,
 ) -> Callable[[], list[np.ndarray]]:
-    """Return a program for the attended features or, with their cotangent, for the gradients of all three arrays."""
+    """Return a program for the attended features and, with their cotangent, for the gradients of all three arrays."""
     torch = import_torch()
     arrays = [torch.from_numpy(array.copy()) for array in (value, locations, weights)]
     if cotangent is None:
@@ -61,6 +61,6 @@ def program(
 
     def backward() -> list[np.ndarray]:
         out = attend(arrays[0], shapes, arrays[1], arrays[2])
-        return [gradient.numpy() for gradient in torch.autograd.grad(out, arrays, given)]
+        return [out.detach().numpy(), *(gradient.numpy() for gradient in torch.autograd.grad(out, arrays, given))]
 
     return backward

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import os
 from collections.abc import Sequence
 from typing import Any
 
@@ -17,6 +18,9 @@ CLASS, CURVE, EXTENT = 3.0, 5.0, 2.0
 
 def import_torch() -> Any:
     """Return PyTorch, with a thread for each core of this process; raise UserError where it is not installed."""
+    # Read when PyTorch is imported. Waiting threads that spin would slow down both sides, PyTorch more than ours.
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+    os.environ.setdefault("GOMP_SPINCOUNT", "0")
     try:
         torch = importlib.import_module("torch")
     except ImportError:

@@ -309,7 +309,7 @@ def test_rows_from_two_trainings_of_a_host_are_told(tiny, tmp_path, capsys, same
 def test_scores_by_an_earlier_state_of_the_code_may_stay(tiny, made, tmp_path, monkeypatch):
     shutil.copytree(made, tmp_path, dirs_exist_ok=True)
     monkeypatch.setattr("tflane_jax.ablations.scores.code_digest", lambda: OTHER_CODE)
-    monkeypatch.setattr("tflane_jax.ablations.table_run.code_digest", lambda: OTHER_CODE)
+    monkeypatch.setattr("tflane_jax.ablations.finished_runs.code_digest", lambda: OTHER_CODE)
     with monkeypatch.context() as patch:
         forbid(patch, "scores.open_run")
         run_table(small(tiny), range(2), tmp_path, scored_by="any code")

@@ -10,6 +10,8 @@ from tests.tiny_run import fakes  # noqa: F401 (a fixture that is used by itself
 from tflane_jax.ablations import workers
 from tflane_jax.ablations.declaration import Claim, Declaration, Declared, check, declare
 from tflane_jax.ablations.jobs import plan_jobs
+from tflane_jax.ablations.recorded import Measured
+from tflane_jax.ablations.results import Results
 from tflane_jax.cli import main
 from tflane_jax.config import load_config
 from tflane_jax.errors import UserError
@@ -88,6 +90,17 @@ def test_mistakes_are_named_before_anything_is_trained(tiny, tmp_path, capsys, a
     assert compare(tiny, tmp_path / "out", "0", *arguments) == 2
     assert message in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+def test_no_configuration_has_the_name_of_an_intervention(tiny, tmp_path, capsys):
+    """Regression: its scores took the place of the intervention's."""
+    rows = ("base={}:baseline", "tfm={}", "tfm, no traffic flow at inference={}")
+    assert compare(tiny, tmp_path / "out", "0", rows=rows) == 2
+    assert "'tfm, no traffic flow at inference' is the name of an intervention on tfm" in capsys.readouterr().err
+    found = Results(("a", "a, b"), (0,), {})
+    found.add("", "last", "a", 0, Measured(1, "p", {"": {}, "b": {}}, {"": {}, "b": {}}))
+    with pytest.raises(UserError, match="two rows are called 'a, b', one of a"):
+        found.add("", "last", "a, b", 0, Measured(1, "p", {"": {}}, {"": {}}))
 
 
 @pytest.mark.slow

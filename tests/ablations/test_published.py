@@ -51,6 +51,22 @@ def test_the_page_leaves_out_best_checkpoints_that_repeat_the_last(tmp_path):
     assert "\ntflane tables tf_lane.5 --seeds 2 --jobs 2\n" in written
 
 
+def test_a_table_of_fewer_runs_is_told_from_the_recorded_one(tmp_path):
+    """Regression: one with as many seeds, but fewer rows or fewer seeds of a row, took its place."""
+
+    def summary(**seeds):
+        rows = [{"model": name, "checkpoint": "last", "seeds": number} for name, number in seeds.items()]
+        return {"table": "x", "seeds": [0, 1], "rows": rows, "models": ["a", "b"], "declared seeds": 2}
+
+    whole = summary(a=2, b=2)
+    assert published._lost(whole, whole, tmp_path) == published._lost(summary(a=2, b=1), whole, tmp_path) == ""
+    assert published._lost(whole, summary(a=2, b=1), tmp_path) == published._lost(whole, summary(a=2), tmp_path)
+    assert published._lost(whole, summary(a=2), tmp_path) == "more runs of b"
+    assert published._lost(whole, summary(a=2, b=2) | {"seeds": [0]}, tmp_path) == "seeds 1"
+    assert published._lost(summary(a=2, old=2), whole, tmp_path) == ""  # a row that the table no longer has
+    assert (published._lacking(whole), published._lacking(summary(a=2))) == ("", "0 to 2 of 2")
+
+
 def test_a_remark_on_several_tables_stands_on_the_page_once(tmp_path):
     summary = dict.fromkeys(("title", "protocol", "declared"), "x") | {"seeds": [0], "steps": [1], "rows": []}
     summary |= {"cores of a run": [1], "commits": [], "devices": [], "core minutes of a run": {"a": 1.0}}

@@ -1,5 +1,6 @@
 """`tflane tables A B`: several tables of one command."""
 
+import dataclasses
 import json
 import re
 from types import SimpleNamespace
@@ -10,7 +11,7 @@ from tests.ablations.test_tables import small
 from tests.slow import with_slow
 from tests.tiny_run import fakes  # noqa: F401 (a fixture that is used by itself)
 from tflane_jax.ablations import workers
-from tflane_jax.ablations.paper.table import TableRow
+from tflane_jax.ablations.paper.table import RateSearch, TableRow
 from tflane_jax.cli import build_parser, main
 from tflane_jax.errors import UserError
 
@@ -24,6 +25,27 @@ def test_all_tables_are_checked_before_the_first_is_trained(tiny, tmp_path, monk
     assert main(["tables", *tables, "--seeds", "1", "--out", str(tmp_path / "out")]) == 2
     assert re.search(r"tfm: .*training\.best_metric", capsys.readouterr().err)
     assert not (tmp_path / "out").exists()
+
+
+def test_all_searches_are_checked_before_the_first_is_trained(tiny, tmp_path, monkeypatch, capsys):
+    search = RateSearch(("fast",), (1e-3,), "all/DET_l")
+    tables = {"paper.9": dataclasses.replace(small(tiny), search=search), "paper.10": small(tiny, name="paper.10")}
+    monkeypatch.setattr("tflane_jax.commands.tables.find_table", tables.get)
+    assert main(["tables", *tables, "--search", "--out", str(tmp_path / "out")]) == 2
+    assert "table paper.10 has no search" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_table_without_a_finished_run_does_not_stop_the_others(tmp_path, monkeypatch, capsys):
+    begun = []
+
+    def begin(table, *_, **__):
+        begun.append(table.name)
+        raise UserError("no run is finished")
+
+    monkeypatch.setattr("tflane_jax.ablations.table_run.begin_table", begin)
+    assert main(["tables", "tf_lane.1", "tf_lane.2", "--finished", "--out", str(tmp_path)]) == 2
+    assert begun == ["tf_lane.1", "tf_lane.2"]
 
 
 @pytest.mark.parametrize("together", with_slow([False, True], quick=[True]))
@@ -56,9 +78,15 @@ def test_chosen_seeds_of_a_table_are_an_interim_look_at_it(tiny, tmp_path, monke
     assert main(["tables", "paper.9", "--seeds", "0,2-2", "--out", str(tmp_path)]) == 0
     assert "**Interim**: 2 of 3 declared seeds (0, 2)." in (tmp_path / "paper.9" / "effects.md").read_text()
     assert json.loads((tmp_path / "paper.9" / "summary.json").read_text())["seeds"] == [0, 2]
+    declaration = tmp_path / "paper.9" / "declaration.json"
+    assert json.loads(declaration.read_text())["begun"] == 0
+    declaration.unlink()
+    assert main(["tables", "paper.9", "--seeds", "1-1", "--out", str(tmp_path)]) == 0
+    # Regression: runs of declared seeds that this command leaves out did not count.
+    assert json.loads(declaration.read_text())["begun"] == 4
     capsys.readouterr()
     assert main(["tables", "paper.9", "--seeds", "3", "--out", str(tmp_path)]) == 0
-    assert "6 runs, 4 complete" in capsys.readouterr().out
+    assert "6 runs, 6 complete" in capsys.readouterr().out
     assert "Interim" not in (tmp_path / "paper.9" / "effects.md").read_text()
 
 

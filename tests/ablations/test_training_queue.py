@@ -2,10 +2,12 @@
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from tflane_jax.ablations.jobs import Job
+from tflane_jax.ablations.table_plan import seed_by_seed
 from tflane_jax.ablations.training_queue import LOOK_SECONDS, Queue, choose
 from tflane_jax.config import RunConfig
 from tflane_jax.errors import UserError
@@ -34,6 +36,14 @@ def test_every_model_gets_a_seed_before_any_gets_the_next(workers):
         mine.add(chosen.config.task)
         seeds += chosen.config.training.seeds
     assert seeds == [3, 3, 3, 4, 4, 4]
+
+
+def test_a_run_that_one_table_has_recorded_and_another_needs_is_trained():
+    needed = job(0, 0)
+    recorded = replace(needed, recorded=SimpleNamespace())
+    for plan in ({"a": [recorded], "b": [needed]}, {"a": [needed], "b": [recorded]}):
+        assert [each.recorded for each in seed_by_seed(plan)] == [None]
+    assert seed_by_seed({"a": [recorded]}) == [recorded]
 
 
 def test_a_worker_prefers_what_it_has_compiled_then_what_nobody_has():

@@ -84,6 +84,19 @@ def test_the_size_that_an_array_claims_is_ignored(tmp_path):
 
 
 @pytest.mark.parametrize(
+    "state", [(1, (0, 10**12), np.dtype("f8"), False, b""), (1, (10**12,), np.dtype("U0"), False, b"")]
+)
+def test_an_array_of_no_bytes_claims_no_length(tmp_path, state):
+    class Long:
+        def __reduce__(self):
+            return np.zeros(0).__reduce__()[0], (np.ndarray, (0,), b"b"), state
+
+    (tmp_path / "long.pkl").write_bytes(pickle.dumps(Long()))
+    with pytest.raises(UserError, match="places in 0 bytes"):
+        load_plain_pickle(tmp_path / "long.pkl")
+
+
+@pytest.mark.parametrize(
     "twice",
     [lambda _: b"2\x86", lambda i: b"q" + bytes([i]) + b"h" + bytes([i]) + b"\x86"],
     ids=["copied", "by number"],

@@ -20,7 +20,7 @@ import gzip
 import json
 import zlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -71,9 +71,14 @@ def merged(there: Archive, new: Archive) -> Archive:
     runs = dict(there.runs)
     for key, run in new.runs.items():
         old = runs.get(key)
-        if old is None or (run.time >= old.time and replace(run, time=old.time) != old):
+        if old is None or (run.time >= old.time and _as_text(replace(run, time=old.time)) != _as_text(old)):
             runs[key] = run
     return Archive(new.table, _earlier(there.declaration, new.declaration), runs)
+
+
+def _as_text(run: RecordedRun) -> str:
+    """Return a run as text, in which a score that is NaN is equal to itself."""
+    return json.dumps(asdict(run), sort_keys=True)
 
 
 def _earlier(there: Mapping[str, Any] | None, new: Mapping[str, Any] | None) -> Mapping[str, Any] | None:

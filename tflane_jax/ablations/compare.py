@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import itertools
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -31,6 +32,7 @@ from tflane_jax.ablations.workers import worker_threads
 from tflane_jax.config import RunConfig
 from tflane_jax.datasets.sources import source_of
 from tflane_jax.errors import UserError
+from tflane_jax.evaluation.interventions import INTERVENTIONS
 from tflane_jax.training.notices import print_notices
 
 
@@ -73,6 +75,7 @@ def compare(
             tables of the others were written.
     """
     tests = dict(tests or {})
+    _check_names(configs)
     _check_tests(configs, tests)
     if declaration is not None:
         check(declaration, configs)
@@ -108,6 +111,13 @@ def compare(
     if summary is not None:
         print(summary(results))
     return tables[0]
+
+
+def _check_names(configs: Mapping[str, RunConfig]) -> None:
+    """Raise UserError for a configuration with the name of a row that is measured of another one."""
+    for model, way in itertools.product(configs, INTERVENTIONS):
+        if (name := f"{model}, {way}") in configs:
+            raise UserError(f"{name!r} is the name of an intervention on {model}: give the configuration another one")
 
 
 def _check_tests(configs: Mapping[str, RunConfig], tests: Tests) -> None:

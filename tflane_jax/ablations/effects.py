@@ -253,20 +253,21 @@ def _effect(
 
 
 def values(by_seed: Mapping[int, Scores], measure: Measure, seeds: Sequence[int]) -> Float[np.ndarray, " s"]:
-    """Return a measure of each seed of a row; raises UserError if a run lacks a score."""
-    every = [(seed, score) for seed in seeds for score in measure.scores]
-    if missing := [(seed, score) for seed, score in every if score not in by_seed[seed]]:
-        raise UserError(
-            f"the run of seed {missing[0][0]} has no {missing[0][1]}: an earlier state of the code measured it; leave "
-            "out --earlier-scores to measure it again"
-        )
-    return np.array([sum(weight * by_seed[seed][score] for score, weight in measure.scores.items()) for seed in seeds])
+    """Return a measure of each seed of a row.
+
+    NaN if a run lacks a score, such as an error of matched lanes where none is matched, or one that the earlier state
+    of the code that measured the run did not know.
+    """
+    terms = measure.scores.items()
+    return np.array([sum(weight * by_seed[seed].get(score, math.nan) for score, weight in terms) for seed in seeds])
 
 
 def _samples(
     results: Results, test: str, which: Which, measure: Measure, rows: Sequence[str], seeds: Sequence[int]
 ) -> dict[str, Float[np.ndarray, " b"]]:
     """Return bootstrap samples of the measure for each row, all of the same draws; empty where a score has none.
+
+    A single scene has none either: all samples of it are alike.
 
     Raises UserError if rows count different lanes, so that they were not measured on the same scenes.
     """
@@ -279,6 +280,9 @@ def _samples(
                 break
         else:
             return {}
+    every = [part for found in parts.values() for of_row in found.values() for part in of_row]
+    if any(len(_drawn_from(part)[0]) < 2 for part in every):
+        return {}
     ranked = [len(part.values) for found in parts.values() for part in found[rows[0]] if isinstance(part, SceneSamples)]
     samples = dict.fromkeys(rows, np.zeros(min(ranked, default=SAMPLES)))
     for score, weight in measure.scores.items():

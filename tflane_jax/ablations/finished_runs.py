@@ -11,7 +11,7 @@ from tflane_jax.ablations.facts import facts
 from tflane_jax.ablations.held_out import load_test_data
 from tflane_jax.ablations.jobs import Failure, Job
 from tflane_jax.ablations.results import Results
-from tflane_jax.ablations.scores import CHECKPOINTS, OWN_TEST, measure, with_test_set
+from tflane_jax.ablations.scores import CHECKPOINTS, OWN_TEST, code_digest, evaluations, measure, with_test_set
 from tflane_jax.ablations.workers import noted, train_all
 from tflane_jax.config import RunConfig
 from tflane_jax.errors import UserError
@@ -156,3 +156,14 @@ def summary_of(failures: Sequence[Failure], count: int) -> str:
     """Return what failed, for the error at the end."""
     lines = [f"{len(failures)} of {count} trainings failed; the same command tries them again:"]
     return "\n  ".join([*lines, *map(str, failures)])
+
+
+def measured_elsewhere(runs: Sequence[Job]) -> list[str]:
+    """Return by which states of the code runs were measured, in words: by other ones, recorded runs by any."""
+    found = [(job, measure(job, config, which)) for job in runs for config, which in evaluations(job)]
+    codes = {
+        measured.code[:9]
+        for job, measured in found
+        if measured is not None and (job.recorded is not None or measured.code != code_digest())
+    }
+    return [f"measured by code of digest{'s' * (len(codes) > 1)} {' and '.join(sorted(codes))}"] if codes else []

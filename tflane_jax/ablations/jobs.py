@@ -244,16 +244,19 @@ def plan_jobs(
     return plan
 
 
+_LONGEST = 100  # letters of a name: with what is appended to it, file systems take 255 bytes
+
+
 def file_names(names: Iterable[str]) -> dict[str, str]:
     """Return a name for files for each name: lower case, letters, digits and underscores.
 
-    Names that would get the same one, or none, also get a hash of the name.
+    Names that would get the same one, or none, also get a hash of the name, and so do long ones, which are cut.
     """
     names = list(names)
-    plain = {name: "".join(c if c.isalnum() else "_" for c in name.lower()).strip("_") for name in names}
+    plain = {name: "".join(c if c.isalnum() else "_" for c in name.lower()).strip("_")[:_LONGEST] for name in names}
     unique = {}
     for name, slug in plain.items():
-        alone = slug and list(plain.values()).count(slug) == 1
+        alone = slug and list(plain.values()).count(slug) == 1 and len(name) <= _LONGEST
         mark = hashlib.sha256(name.encode()).hexdigest()[:8]
         unique[name] = slug if alone else f"{slug or 'run'}-{mark}"
     return unique

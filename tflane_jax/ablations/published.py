@@ -33,8 +33,9 @@ def record(summaries: Sequence[Path], folder: Path) -> Path:
     """Copy summaries (see `table_run`), if any, into the folder of results, write its page anew, and return the page.
 
     The page lies beside the folder: `docs/results` has `docs/results.md`. The runs of each table are added to those in
-    `docs/results/scores`, and the pictures of `draw_claims` are drawn where matplotlib is installed. A summary that
-    lacks seeds of the one that is there does not replace it: its tests would be of fewer runs than are recorded.
+    `docs/results/scores`, and the pictures of `draw_claims` are drawn where matplotlib is installed. A summary with
+    fewer seeds of a row than the one that is there does not replace it: its tests would be of fewer runs than are
+    recorded.
 
     Raises:
         UserError: a summary is of a quick run, or what was recorded before is damaged.
@@ -47,11 +48,11 @@ def record(summaries: Sequence[Path], folder: Path) -> Path:
         new, place = read_archive(path.with_name(FILE)), archive_path(folder, name)
         write_archive(place, merged(read_archive(place), new) if place.exists() else new)
         there, seeds = folder / f"{name}.json", set(member(content, "seeds", str(path)))
-        if there.exists() and (lost := set(member(load_json(there), "seeds", str(there))) - seeds):
+        if there.exists() and (lost := _lost(load_json(there), content, there)):
             print(
                 f"{name}: the runs of seeds {_listed(sorted(seeds))} were added to the record; its table stays that of "
-                f"before, which also has seeds {_listed(sorted(lost))}. For a table of all: tflane tables {name} "
-                f"--from {folder} --record {folder}, with --seeds for some of them"
+                f"before, which also has {lost}. For a table of all: tflane tables {name} --from {folder} "
+                f"--record {folder}, with --seeds for some of them"
             )
             continue
         write_text(there, json.dumps(content, indent=1) + "\n")
@@ -59,6 +60,23 @@ def record(summaries: Sequence[Path], folder: Path) -> Path:
     if importlib.util.find_spec("matplotlib") is not None:
         draw_claims(folder)
     return written
+
+
+def _lost(before: Mapping[str, Any], now: Mapping[str, Any], place: Path) -> str:
+    """Return what a recorded summary has and another one lacks: seeds, or runs of a row; "" for nothing."""
+    if seeds := sorted(set(member(before, "seeds", str(place))) - set(now["seeds"])):
+        return f"seeds {_listed(seeds)}"
+    there, here = (_seeds_by_row(summary) for summary in (before, now))
+    fewer = [row for row, number in there.items() if row in here and here[row] < number]
+    # Rows may have other names since; a name that both have, or that the new plan names, is the same row.
+    gone = [row for row in there if row not in here and row in now.get("models", ())]
+    return f"more runs of {(fewer + gone)[0]}" if fewer or gone else ""
+
+
+def _seeds_by_row(summary: Mapping[str, Any]) -> dict[str, int]:
+    """Return how many seeds each row has at the last checkpoint."""
+    last = (row for row in summary["rows"] if row.get("checkpoint", "last") == "last")
+    return {row["model"]: row.get("seeds", len(summary["seeds"])) for row in last}
 
 
 def draw_claims(folder: Path) -> None:
@@ -132,6 +150,8 @@ def _anchor(summary: Mapping[str, Any]) -> str:
 
 
 def _between(numbers: Collection[float]) -> str:
+    if not numbers:  # runs without records
+        return "an unknown number of"
     least, most = round(min(numbers)), round(max(numbers))
     return str(least) if least == most else f"{least} to {most}"
 
@@ -222,9 +242,9 @@ def _lacking(summary: Mapping[str, Any]) -> str:
 
 def _fewest_and_most(summary: Mapping[str, Any]) -> tuple[int, int]:
     """Return how many seeds the rows have that have the fewest, and how many the table has."""
-    most = len(summary["seeds"])
-    last = (row for row in summary["rows"] if row.get("checkpoint", "last") == "last")
-    return min((row.get("seeds", most) for row in last), default=most), most
+    most, found = len(summary["seeds"]), _seeds_by_row(summary)
+    missing = [0 for model in summary.get("models", ()) if model not in found]  # earlier summaries name no models
+    return min([*found.values(), *missing], default=most), most
 
 
 def _cores_option(summary: Mapping[str, Any]) -> str:

@@ -53,7 +53,10 @@ class Results:
             raise UserError(f"seed {seed} of {model} is measured by {measured.protocol}, earlier ones by {first}")
         for way, scores in measured.ways.items():
             row = f"{model}, {way}" if way else model
-            self.owners[row] = model
+            if self.owners.setdefault(row, model) != model:
+                raise UserError(
+                    f"two rows are called {row!r}, one of {self.owners[row]}: name a configuration otherwise"
+                )
             self.scores.setdefault((test, which), {}).setdefault(row, {})[seed] = dict(scores)
             self.ratios.setdefault((test, which), {}).setdefault(row, {})[seed] = measured.ratios[way]
             self.samples.setdefault((test, which), {}).setdefault(row, {})[seed] = measured.samples.get(way, {})

@@ -73,7 +73,10 @@ def is_measured(job: Job) -> bool:
     if not job.is_complete():
         return False
     kept = dict(_read(_file(job)))
-    checkpoints = (_checkpoint(job, config, which) for config, which in evaluations(job))
+    try:
+        checkpoints = [_checkpoint(job, config, which) for config, which in evaluations(job)]
+    except UserError:  # a damaged checkpoint: `measure_all` tells it, as a failure of this run alone
+        return False
     return all(_valid(kept, parts, job) is not None for _, parts in filter(None, checkpoints))
 
 

@@ -124,15 +124,29 @@ def _planned(
     return TablePlan(table, rows, hosts, stored_jobs(rows, seeds, store, threads=threads, origins=origins), host_jobs)
 
 
+def with_seeds(plan: TablePlan, seeds: Sequence[int], store: Path, threads: Mapping[str, Any]) -> dict[str, list[Job]]:
+    """Return the trainings of the rows of a plan, and those of further seeds."""
+    further = _planned(plan.table, plan.rows, plan.hosts, seeds, store, threads).jobs
+    return {
+        name: list({job.folder: job for job in (*further[name], *jobs)}.values()) for name, jobs in plan.jobs.items()
+    }
+
+
 def store_of(out: Path, *, quick: bool) -> Path:
     """Return the folder of runs below the folder of all tables."""
     return (out / "quick" if quick else out) / "runs"
 
 
 def seed_by_seed(plan: Mapping[str, Sequence[Job]]) -> list[Job]:
-    """Return every run once, seed by seed, so that a table stopped early has pairs."""
-    every = [job for of_seed in itertools.zip_longest(*plan.values()) for job in of_seed if job is not None]
-    return list({job.folder: job for job in every}.values())
+    """Return every run once, seed by seed, so that a table stopped early has pairs.
+
+    Of a run that one table takes from a record and another one has to train, the training.
+    """
+    found: dict[Path, Job] = {}
+    for job in (job for of_seed in itertools.zip_longest(*plan.values()) for job in of_seed if job is not None):
+        if job.folder not in found or job.recorded is None:
+            found[job.folder] = job
+    return list(found.values())
 
 
 def _other_hosts(plan: TablePlan) -> list[str]:

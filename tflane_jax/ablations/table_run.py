@@ -33,6 +33,7 @@ from tflane_jax.ablations.finished_runs import (
     draw_models,
     evaluate_others,
     first_models,
+    measured_elsewhere,
     save_plan,
     summary_of,
 )
@@ -40,10 +41,18 @@ from tflane_jax.ablations.jobs import Failure, Job, ScoredBy
 from tflane_jax.ablations.paper.table import PaperTable
 from tflane_jax.ablations.results import Results
 from tflane_jax.ablations.reuse import FILE, InterimRecord, add_to_record, archive_of, unused
-from tflane_jax.ablations.scores import CHECKPOINTS, OWN_TEST, code_digest, evaluations, measure
+from tflane_jax.ablations.scores import CHECKPOINTS, OWN_TEST, measure
 from tflane_jax.ablations.store import TOPOLOGY
-from tflane_jax.ablations.table_plan import TablePlan, plan_table, seed_by_seed, store_of, tell_unfinished, tell_work
-from tflane_jax.ablations.workers import train_all
+from tflane_jax.ablations.table_plan import (
+    TablePlan,
+    plan_table,
+    seed_by_seed,
+    store_of,
+    tell_unfinished,
+    tell_work,
+    with_seeds,
+)
+from tflane_jax.ablations.workers import train_all, worker_threads
 from tflane_jax.datasets.sources import source_of
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import write_json, write_text
@@ -134,19 +143,23 @@ def begin_table(
     plan = planned.jobs
     # Fewer seeds than the table has are an interim look at it.
     every = sorted({*seeds, *range(0 if quick else table.seeds)})
+    # Runs of declared seeds that this command leaves out may have begun, too.
+    of_all = with_seeds(planned, every, store_of(out, quick=quick), worker_threads(jobs, cores))
+
+    def declared_in(place: Path) -> Declared:
+        return declare(table.declaration, of_all, planned.declared(), every, place)
+
     if archive is not None:
-        _adopt_declaration(
-            archive, folder, lambda trial: declare(table.declaration, plan, planned.declared(), every, trial)
-        )
+        _adopt_declaration(archive, folder, declared_in)
         for line in unused(plan, archive, table.declaration.scores):
             print(line)
     try:
-        declared = declare(table.declaration, plan, planned.declared(), every, folder)
+        declared = declared_in(folder)
     except UserError:
         if not quick:
             raise
         (folder / DECLARATION).unlink()  # that of an earlier smoke test, which was no result
-        declared = declare(table.declaration, plan, planned.declared(), every, folder)
+        declared = declared_in(folder)
     if not finished:
         tell_work(planned, planned.seeds(), store_of(out, quick=quick), jobs, quick=quick)
         content, tested = load_json(folder / DECLARATION), table.declaration.scores
@@ -320,11 +333,12 @@ def _save_summary(
             "protocol": results.protocol(),
             "declared": declared.sentence(),
             "note": table.note,
+            "models": list(results.models),
             "seeds": list(results.seeds),
             "declared seeds": len(declared.seeds),
             "steps": {name: jobs[0].config.training.steps for name, jobs in trained.items() if jobs},
             "cores of a run": sorted({job.threads["cores"] for job in runs}),
-            "commits": [*commits(runs), *_measured_elsewhere(runs)],
+            "commits": [*commits(runs), *measured_elsewhere(runs)],
             "mixed hosts": mixed_hosts(table.rows, trained),
             "devices": sorted({device for job in runs for device in facts(job).devices}),
             "core minutes of a run": row_minutes(trained),
@@ -333,14 +347,3 @@ def _save_summary(
             "quoted": asdict(table.quoted),
         },
     )
-
-
-def _measured_elsewhere(runs: Sequence[Job]) -> list[str]:
-    """Return by which states of the code runs were measured, in words: by other ones, recorded runs by any."""
-    found = [(job, measure(job, config, which)) for job in runs for config, which in evaluations(job)]
-    codes = {
-        measured.code[:9]
-        for job, measured in found
-        if measured is not None and (job.recorded is not None or measured.code != code_digest())
-    }
-    return [f"measured by code of digest{'s' * (len(codes) > 1)} {' and '.join(sorted(codes))}"] if codes else []

@@ -42,6 +42,7 @@ def render(options: argparse.Namespace) -> int:
     rig = CameraRigConfig(cameras=ring[: options.cameras], scale=options.scale, markers=True)
     check_settings(rig, "--")
     check_folder(options.out)
+    opencv()  # before anything is simulated
     if options.out.is_dir() and any(options.out.iterdir()):
         raise UserError(f"{options.out} is not empty: choose another folder (--out), images of two drives would mix")
     # Two seconds of history come before the first frame.

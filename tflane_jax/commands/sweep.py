@@ -17,7 +17,7 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> int:
     if empty := [reference for reference in options.runs if reference.startswith("=")]:
         raise UserError(f"{empty[0]}: the name before = is empty")
     pairs = [reference.partition("=") for reference in options.runs]
-    models = {name if path else Path(name).name: Path(path or name) for name, _, path in pairs}
+    models = {name if path else Path(name).resolve().name: Path(path or name) for name, _, path in pairs}
     if len(models) < len(pairs):
         raise UserError("two of the folders have the same name: write NAME=FOLDER to tell them apart")
     configure_jax()

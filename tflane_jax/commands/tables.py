@@ -65,10 +65,13 @@ def run(options: argparse.Namespace) -> int:
         for table in chosen:
             _convert(table.conversions)
     if options.search:
-        from tflane_jax.ablations.rate_search import search_rates
+        from tflane_jax.ablations.rate_search import plan_search, search_rates
 
+        searched = {"jobs": jobs, "cores": options.cores, "quick": options.quick}
+        for table in chosen:  # errors of the last one come before the first one is trained
+            plan_search(table, options.out, **searched)
         for table in chosen:
-            search_rates(table, options.out, jobs=jobs, cores=options.cores, quick=options.quick)
+            search_rates(table, options.out, **searched)
         return 0
     from tflane_jax.ablations.reuse import find_archives
     from tflane_jax.ablations.table_plan import plan_table
@@ -79,7 +82,7 @@ def run(options: argparse.Namespace) -> int:
     how["scored_by"] = "any code" if options.earlier_scores else "this code"
     seeds = {table.name: options.seeds or range(2 if options.quick else table.seeds) for table in chosen}
     archives = {} if options.source is None else find_archives(options.source, [table.name for table in chosen])
-    if len(chosen) > 1:  # errors of the last one come before the first one is trained
+    if len(chosen) > 1 and not options.finished:  # errors of the last one come before the first one is trained
         for table in chosen:
             plan_table(table, seeds[table.name], options.out, archive=archives.get(table.name), **how)
     written: list[Path] = []

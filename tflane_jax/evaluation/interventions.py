@@ -17,6 +17,9 @@ from tflane_jax.scene import Example, TrafficFlow
 
 NO_TRAFFIC = "no traffic flow at inference"
 """Name of the intervention in which a model that was trained with traffic flow gets none."""
+OTHER_TRAFFIC = "traffic of another scene"
+"""Name of the intervention in which it gets that of another scene."""
+INTERVENTIONS = (NO_TRAFFIC, OTHER_TRAFFIC)
 _SEED = 0
 
 
@@ -58,7 +61,7 @@ def traffic_interventions(arrays: Example | Streamed, config: EvaluationConfig) 
         return {}
     found = {NO_TRAFFIC: replace(config, traffic="none")}
     if len(np.unique(scene_numbers(arrays))) > 1:
-        found["traffic of another scene"] = replace(config, traffic="other-scene")
+        found[OTHER_TRAFFIC] = replace(config, traffic="other-scene")
     return found
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import zipfile
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import IO
 
@@ -18,6 +18,10 @@ _MOST_MEMORY = 2**34
 # Bytes that one byte may hold by the compression of the archive; numpy writes these two. Deflate's limit: zlib's
 # technical details.
 _MOST_HELD = {zipfile.ZIP_STORED: 1, zipfile.ZIP_DEFLATED: 1032}
+
+
+# Places along the axes of an array that holds nothing: 10,000 frames of 100 lanes are a million.
+_MOST_PLACES = 10**7
 
 
 class HoldsObjects(ValueError):
@@ -76,6 +80,17 @@ def _check_sizes(parts: list[zipfile.ZipInfo], size: int) -> None:
         raise ValueError(f"its arrays claim {needed:.2g} bytes")
 
 
+def check_places(shape: Sequence[int], size: int) -> None:
+    """Raise ValueError if an array of few bytes, or none, claims so many places that arrays beside it fill the memory.
+
+    Args:
+        shape: with a 0 in it, or of elements without size, it may claim any length in `size` bytes.
+        size: of the array in the file, bytes.
+    """
+    if (places := math.prod(max(length, 1) for length in shape)) > max(_MOST_PLACES, size):
+        raise ValueError(f"an array of shape {tuple(shape)} claims {places:.2g} places in {size} bytes")
+
+
 def _check_header(archive: zipfile.ZipFile, part: zipfile.ZipInfo) -> None:
     """Raise ValueError if the header of an array claims objects, or another size than the archive has for it."""
     with archive.open(part) as content:
@@ -84,6 +99,7 @@ def _check_header(archive: zipfile.ZipFile, part: zipfile.ZipInfo) -> None:
         shape, _, dtype = read(content)
         if dtype.hasobject:
             raise HoldsObjects(f"{part.filename.removesuffix('.npy')} holds Python objects")
+        check_places(shape, part.file_size)
         claimed = math.prod(shape) * dtype.itemsize
         if claimed != part.file_size - content.tell():
             has = f"but the file has {part.file_size - content.tell()} for it"

@@ -21,6 +21,7 @@ from typing import IO, Any, Literal, NamedTuple
 import numpy as np
 
 from tflane_jax.errors import UserError
+from tflane_jax.files.npz import check_places
 
 # Truth values, numbers, strings, objects, dates and records.
 _CODE = re.compile(r"[<>=|]?(\?|[biufcSUOMmV]\d{0,6})")
@@ -205,6 +206,7 @@ class _FilledArray(np.ndarray):
                     raise pickle.UnpicklingError("an array and its content have different types")
                 if isinstance(data, list) and len(data) != math.prod(shape):
                     raise pickle.UnpicklingError(f"an array of shape {shape} has {len(data)} elements")
+                check_places(shape, len(data) if isinstance(data, (bytes, list)) else 0)
                 form: Any = bool(by_column)  # its stub asks for numpy's own, which it refuses
                 super().__setstate__((1, shape, kind.dtype, form, data))
             case _:
@@ -238,6 +240,7 @@ def _scalar(kind: _Type, data: bytes = b"") -> Any:
 
 def _from_buffer(buffer: Any, kind: _Type, shape: tuple[int, ...], order: Literal["C", "F"]) -> np.ndarray:
     """Return an array stored inside the file, as by protocol 5."""
+    check_places(shape, len(buffer))
     return np.frombuffer(buffer, _plain(kind)).reshape(shape, order=order)
 
 

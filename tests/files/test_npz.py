@@ -57,12 +57,11 @@ def test_a_small_file_that_claims_gigabytes_is_refused_before_they_are_taken(tmp
         tracemalloc.stop()
 
 
-@pytest.mark.parametrize(("shape", "kind"), [((1, 40_000_000, 0, 3), "f4"), ((10**12,), "U0"), ((10**12,), [])])
+@pytest.mark.parametrize(("shape", "kind"), [((1, 40_000_000, 0, 3), "<f4"), ((10**12,), "<U0"), ((10**12,), [])])
 def test_an_array_of_no_bytes_claims_no_length(tmp_path, shape, kind):
     """Regression: arrays that are as long as its lanes took gigabytes."""
-    array = np.lib.stride_tricks.as_strided(np.zeros(0, kind), shape, (0,) * len(shape))
     stream = io.BytesIO()
-    npy.write_array_header_1_0(stream, npy.header_data_from_array_1_0(array))
+    npy.write_array_header_1_0(stream, {"descr": kind, "fortran_order": False, "shape": shape})
     with zipfile.ZipFile(tmp_path / "small.npz", "w") as archive:
         archive.writestr("points.npy", stream.getvalue())
     with pytest.raises(UserError, match=r"claims .* places in \d+ bytes"):

@@ -99,8 +99,8 @@ def _check_header(archive: zipfile.ZipFile, part: zipfile.ZipInfo) -> None:
         shape, _, dtype = read(content)
         if dtype.hasobject:
             raise HoldsObjects(f"{part.filename.removesuffix('.npy')} holds Python objects")
-        check_places(shape, part.file_size)
         claimed = math.prod(shape) * dtype.itemsize
         if claimed != part.file_size - content.tell():
             has = f"but the file has {part.file_size - content.tell()} for it"
             raise ValueError(f"{part.filename} claims {claimed:.2g} bytes, {has}")
+        check_places(shape, part.file_size)

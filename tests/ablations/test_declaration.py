@@ -159,6 +159,8 @@ def test_a_treatment_with_a_comma_in_its_name_is_quoted():
     claims = (Claim("GTN"), Claim("GTN, Eq. (2)", "GTN"), Claim("GTN", "GCN"))
     text = Declared(Declaration("all/recall", claims), (0,), "2026-11-26", 0).sentence()
     assert 'treatment GTN, "GTN, Eq. (2)", level 0.05' in text
+    alone = Declared(Declaration("all/recall", ()), (0,), "2026-11-26", 0).sentence()
+    assert "primary measure all/recall, no claim, level 0.05, 1 seed." in alone
 
 
 def test_the_configurations_of_the_rows_are_declared(tiny, tmp_path):

@@ -100,9 +100,8 @@ class Declared:
         names = dict.fromkeys(claim.treatment for claim in self.declaration.claims)
         treatments = ", ".join(f'"{name}"' if "," in name else name for name in names)
         seeds = "1 seed" if len(self.seeds) == 1 else f"{len(self.seeds)} seeds"
-        text = (
-            f"Declared {when} ({self.time}): {what}, treatment {treatments}, level {self.declaration.alpha:g}, {seeds}."
-        )
+        what += f", treatment {treatments}" if names else ", no claim"
+        text = f"Declared {when} ({self.time}): {what}, level {self.declaration.alpha:g}, {seeds}."
         if _CONFIGURATIONS in self.missing:
             text += " This declaration of an earlier version holds no configurations: those of the rows may be later."
         return text

@@ -130,9 +130,12 @@ def _range(rows: Float[np.ndarray, " h"]) -> str:
 
 
 def _checked(x: Float[np.ndarray, "l h"], rows: int, what: str) -> Float[np.ndarray, "l h"]:
-    if len({np.shape(lane) for lane in x}) > 1:
-        raise UserError(f"{what}: lanes have different numbers of rows, expected {rows}: one x for each of the truth's")
-    x = np.asarray(x, np.float64)
+    try:
+        x = np.asarray(x, np.float64)
+    except ValueError as error:
+        raise UserError(
+            f"{what}: lanes have different numbers of rows, expected {rows} numbers in each ({error})"
+        ) from None
     if x.ndim and len(x) == 0:  # no lanes: an empty list has no number of rows
         return np.zeros((0, rows))
     if x.ndim != 2 or x.shape[1] != rows:

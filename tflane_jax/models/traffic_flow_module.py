@@ -77,7 +77,7 @@ class TrafficFlowModuleConfig:
     remat: bool = False
 
     def limits(self) -> Rules:
-        """Lanes read traffic, channels split over heads, each of which has its window; modules of a joint softmax."""
+        """Lanes read traffic; channels split over heads; a window for each head; what a joint softmax can take."""
         yield splits("heads", self.heads, "width", self.width)
         yield "fusions", "L->T" in self.fusions, "such that L->T is among them, by which lanes read traffic"
         together = self.masking.softmax != "joint" or set(self.fusions) in (set(LANE_FUSIONS), set(ALL_FUSIONS))

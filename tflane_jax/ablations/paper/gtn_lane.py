@@ -19,7 +19,7 @@ _EQ_2, _WITH_RULE = ", Eq. (2)", ", Eq. (2) and rule"
 # Learning rates by encoder, chosen by hand; after a search, its rates stand here and _BY_HAND goes. A search that was
 # stopped (docs/gtn_lane.md) found 5e-4 for the transformer; GTN and GCN were best at 1e-3, in runs that had not ended.
 _RATES = dict.fromkeys(_ENCODERS, "1e-3") | {_TRANSFORMER: "5e-4"}
-_FINE_TUNING_RATES = dict.fromkeys(_ENCODERS, "1e-4")
+_FINE_TUNING_RATES = {_TRANSFORMER: "1e-4", _GTN: "1e-4", _GCN: "1e-4", _HAN: "1e-4"}
 
 _QUOTED = Quoted(
     "TuSimple, split not named; TuSimple's metric, percent; frames per second on hardware not named",

@@ -11,7 +11,7 @@ import pytest
 import tyro
 
 from tflane_jax.commands import train
-from tflane_jax.config import OpenLaneV2Data, RunConfig, epochs_of
+from tflane_jax.config import OpenLaneV2Data, RunConfig, epochs_of, load_config
 from tflane_jax.config_io import from_json, settings, to_json
 from tflane_jax.config_overrides import _without_boxes, apply_overrides, batch_notices
 from tflane_jax.errors import UserError
@@ -194,11 +194,25 @@ def test_another_batch_may_keep_the_number_of_examples(arguments, expected):
             ["--optim.restarts.cycle-steps", "100"],
             OptimConfig(restarts=RestartsConfig(100)),
         ),
+        (  # 40 of 67,430 steps after the warm-up are 19 of 33,710
+            OptimConfig(warmup_steps=10, restarts=RestartsConfig(40, last_cycle="fit")),
+            [],
+            OptimConfig(warmup_steps=10, restarts=RestartsConfig(19, last_cycle="fit")),
+        ),
     ],
 )
 def test_drops_and_cycles_are_divided_too_unless_they_are_given(optim, arguments, expected):
     config = apply_overrides(replace(RESNET, optim=optim), ["--training.batch-size", "16", SAME, *arguments])
     assert config.optim == expected
+
+
+@pytest.mark.parametrize("batch", [2, 8, 32])
+@pytest.mark.parametrize("name", ["gtn_lane/table1:gtn_restarts", "gtn_lane/fine_tuned:gtn_restarts"])
+def test_cycles_that_fill_a_run_are_as_many_with_another_batch(name, batch):
+    config = apply_overrides(load_config(name), ["--training.batch-size", str(batch), SAME])
+    restarts, steps = config.optim.restarts, config.training.steps
+    rest = steps - config.optim.warmup_steps - 7 * restarts.cycle_steps  # cycles of 1, 2 and 4 parts
+    assert 0 <= rest < 7
 
 
 def test_tflane_train_tells_what_another_batch_trains(tmp_path, capsys):

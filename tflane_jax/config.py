@@ -154,8 +154,9 @@ def with_same_examples(config: RunConfig, chosen: RunConfig, given: Collection[s
     """Return a configuration that trains on as many examples as the one whose numbers were chosen for its batch.
 
     With `training.same_examples`, the settings of `with_step_counts` are divided by the ratio of the batch sizes and
-    rounded up; whole epochs (`optim.epoch_steps`) stay whole. `training.log_every` and the warm-up stay. Without it
-    nothing changes.
+    rounded up; whole epochs (`optim.epoch_steps`) stay whole. `training.log_every` and the warm-up stay. Cycles that
+    are to fill the run (`optim.restarts.last_cycle` "fit") keep their part of what follows the warm-up, rounded down,
+    so that as many fit as before. Without it nothing changes.
 
     Args:
         config: with the batch size to train with.
@@ -172,14 +173,23 @@ def with_same_examples(config: RunConfig, chosen: RunConfig, given: Collection[s
     def divided(number: int) -> int:
         return -(-number * before // after)
 
+    def fitted(number: int) -> int:
+        warmup = config.optim.warmup_steps
+        steps = config.training.steps if stays("training.steps") else change("training.steps", chosen.training.steps)
+        if min(steps, chosen.training.steps) <= warmup:  # an error, told where the schedule is made
+            return divided(number)
+        return max(number * (steps - warmup) // (chosen.training.steps - warmup), 1)
+
     epoch = chosen.optim.epoch_steps
     new_epoch = config.optim.epoch_steps if stays("optim.epoch_steps") else divided(epoch)
 
     def change(name: str, number: int) -> int:
         if stays(name):
             return number
-        whole_epochs = epoch > 0 and new_epoch > 0 and number % epoch == 0
-        return number // epoch * new_epoch if whole_epochs else divided(number)
+        if epoch > 0 and new_epoch > 0 and number % epoch == 0:
+            return number // epoch * new_epoch
+        fits = config.optim.restarts is not None and config.optim.restarts.last_cycle == "fit"
+        return fitted(number) if fits and name == "optim.restarts.cycle_steps" else divided(number)
 
     return with_step_counts(config, change)
 

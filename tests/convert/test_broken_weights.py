@@ -268,6 +268,13 @@ def test_encoders_without_a_place_for_the_weights_are_named(encoder, message, pa
         load_lstr(write(path, lstr_state()), replace(TINY, encoder=encoder))
 
 
+@pytest.mark.parametrize("setting", [{"anchors": (0.35, 1.0)}, {"located": True}])
+def test_networks_in_which_the_weights_mean_something_else_are_named(setting, path):
+    (name,) = setting
+    with pytest.raises(UserError, match=rf"w.npz: .*mean something else where task.model.{name} is"):
+        load_lstr(write(path, lstr_state()), replace(TINY, **setting))
+
+
 def test_edge_weights_are_checked(path):
     write(path, lstr_state())
     for weight in (0.0, -1.0, 1.5, float("nan")):

@@ -1,12 +1,13 @@
 """Published weights are found by name, and only those."""
 
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from tests.convert.lstr_state import TINY, lstr_state
+from tests.convert.lstr_state import LAYER, TINY, lstr_state
 from tests.convert.torch_files import of, write_zip
 from tests.shared import shared_path
 from tflane_jax.commands.convert import convert
@@ -16,6 +17,7 @@ from tflane_jax.convert.published import load_weights
 from tflane_jax.convert.torch_file import read_state_dict
 from tflane_jax.convert.weights_files import PUBLISHED, digest_of, find_weights
 from tflane_jax.errors import UserError
+from tflane_jax.models.lstr import TransformerEncoderConfig
 
 LSTR = PUBLISHED["lstr"]
 
@@ -67,6 +69,25 @@ def test_an_average_beside_the_weights_is_named_and_can_be_taken(tmp_path):
     assert not [row for row in table if row["becomes"].startswith("not read")]
     for entry, found in zip(kinds, (params, averaged), strict=True):
         np.testing.assert_array_equal(found["queries"], kinds[entry]["query_embed.weight"])
+
+
+@pytest.mark.parametrize(
+    ("part", "change"),
+    [
+        ("decoder.heads", {"decoder": replace(LAYER, heads=4)}),
+        ("decoder.norm_first", {"decoder": replace(LAYER, norm_first=True)}),
+        ("encoder.layer.heads", {"encoder": TransformerEncoderConfig(1, replace(LAYER, heads=1))}),
+        ("encoder.layer.activation", {"encoder": TransformerEncoderConfig(1, replace(LAYER, activation="gelu"))}),
+    ],
+)
+def test_of_the_published_tensors_the_layers_are_known(tmp_path, monkeypatch, part, change):
+    model, state = replace(TINY, **change), lstr_state()
+    path = write_zip(tmp_path / "w.pth", {"state_dict": {key: of(tensor) for key, tensor in state.items()}})
+    load_lstr(path, model)  # a training of one's own may have had any
+    monkeypatch.setitem(PUBLISHED, "lstr", replace(LSTR, digest=digest_of(state)))
+    load_lstr(path, TINY)
+    with pytest.raises(UserError, match=rf"w.pth: .*mean something else where task.model.{part} is"):
+        load_lstr(path, model)
 
 
 def test_paths_are_paths(folders):

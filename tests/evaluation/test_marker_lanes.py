@@ -28,6 +28,8 @@ def test_lanes_are_those_that_enter_eq_3_and_scores_their_trust():
     np.testing.assert_allclose(found.scores[valid], (lanes.weight * lanes.gate)[valid], rtol=1e-5)
     np.testing.assert_allclose(found.scores[~valid], 0.0, atol=2e-6)
     assert not alone.streams
+    assert MarkerLanes(HOST).streams
+    assert not MarkerLanes(HOST, remembers=False).streams
 
 
 def test_remembered_lanes_stay_and_padding_may_hold_anything():

@@ -74,10 +74,13 @@ def test_lanes_are_thinned_keep_their_ends_and_come_in_order_of_trust():
 
 def test_beyond_capacity_the_least_trusted_are_left_out():
     markers = observations()
-    many, few = (select_marker_lanes(markers, MarkerPriorConfig(3, lanes=count)) for count in (7, 2))
-    for name in ("points", "confidence", "valid"):
-        np.testing.assert_array_equal(getattr(many, name)[:2], getattr(few, name))
-    np.testing.assert_array_equal(many.successor[:2, :2], few.successor)
+    expected = expected_lanes(markers)
+    trusted = [markers.lanes[m, j, ::2, :2] for trust, m, j in expected if trust == expected[0][0]]
+    assert len(trusted) < len(expected)
+    few = select_marker_lanes(markers, MarkerPriorConfig(3, lanes=len(trusted)))
+    assert few.valid.all()
+    assert sorted(few.points.tolist()) == sorted(np.stack(trusted).tolist())
+    np.testing.assert_allclose(few.confidence, expected[0][0], rtol=1e-5)
 
 
 def test_edges_stay_within_their_marker():
@@ -153,3 +156,14 @@ def test_of_lanes_that_are_trusted_alike_the_nearest_are_kept():
             found = select(markers, MarkerPriorConfig(lanes=count, points=3))
             assert found.valid.all()
             np.testing.assert_allclose(found.points[:, 0, 1], kept)
+
+
+def test_the_lane_under_the_vehicle_is_kept_although_its_points_are_far_away():
+    empty = MarkerObservations.empty(1, 2, 3)
+    lanes = np.zeros((1, 2, 3, 3), np.float32)
+    lanes[0, 0, :, 0], lanes[0, 1, :, 0] = [-12.0, -4.5, 4.5], [-9.0, 0.0, 9.0]
+    lanes[0, 1, :, 1] = 4.0  # beside the vehicle, with a point nearer than any of the other lane
+    markers = empty.replace(lanes=lanes, lane_valid=np.ones((1, 2), bool), valid=np.array([True]), score=np.ones(1))
+    for select in (select_marker_lanes, jax.jit(select_marker_lanes, static_argnums=1)):
+        found = select(markers, MarkerPriorConfig(lanes=1, points=3))
+        np.testing.assert_allclose(found.points[0, :, 1], 0.0)

@@ -277,6 +277,10 @@ def test_a_constant_rate_drops_at_its_steps():
         ({"epoch_steps": 10}, ["optim.epoch_steps"]),
         ({"drops": DropsConfig((4, 9))}, []),
         ({"drops": DropsConfig((4, 10, 20))}, ["before the learning rate drops at 10"]),
+        ({"restarts": RestartsConfig(7), "warmup_steps": 2}, []),
+        ({"restarts": RestartsConfig(8), "warmup_steps": 2}, ["optim.restarts: the run ends at step 10, before"]),
+        ({"restarts": RestartsConfig(3, last_cycle="fit"), "warmup_steps": 1}, []),
+        ({"restarts": RestartsConfig(3, last_cycle="fit"), "warmup_steps": 2}, ["optim.restarts: the run ends"]),
     ],
 )
 def test_what_of_the_schedule_a_run_does_not_reach_is_told(settings, names):

@@ -7,7 +7,7 @@ with a graph encoder take them too (`convert.lstr_graphs`).
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import jax
@@ -17,9 +17,10 @@ from tflane_jax.convert.fitting import Expected, Missing, expected_variables, fi
 from tflane_jax.convert.lstr_graphs import GRAPH_LAYER, UNMAPPED, as_graph_state, check_encoder, selections
 from tflane_jax.convert.renaming import Converted, Rule, below, check_types, convert, naming, put, size_text
 from tflane_jax.convert.torch_file import read_checkpoint
-from tflane_jax.convert.weights_files import check_digest, find_weights
+from tflane_jax.convert.weights_files import check_digest, find_weights, is_published
 from tflane_jax.errors import UserError
 from tflane_jax.geometry.namespace import AnyArray
+from tflane_jax.layers.transformer import TransformerConfig
 from tflane_jax.models.graph_encoders import GtnEncoderConfig
 from tflane_jax.models.lstr import EncoderConfig, LstrConfig, TransformerEncoderConfig
 from tflane_jax.models.parameters import Params
@@ -117,11 +118,12 @@ def load_lstr(
         entry: path of the weights in the file, see `torch_file.read_checkpoint`.
 
     Raises:
-        UserError: the file cannot be read, its tensors are not exactly those of the model, or the encoder has other
-            sizes than LSTR's.
+        UserError: the file cannot be read, its tensors are not exactly those of the model, the encoder has other sizes
+            than LSTR's, or the network reads tensors of these sizes in another way.
     """
     path, published = find_weights(path)
     with naming(path):
+        _check_meaning(model)
         check_encoder(model, edge_weight)
     unmapped = UNMAPPED.get(type(model.encoder), "(?!)")
     if missing != "fresh" and unmapped != "(?!)":
@@ -133,8 +135,35 @@ def load_lstr(
         check_types(checkpoint.others, _PUBLISHED)
         check_digest(checkpoint.tensors, path, published)
         converted = convert_lstr(checkpoint.tensors, model.encoder, edge_weight)
+        if is_published(checkpoint.tensors):
+            _check_layers(model)
     params, table = fitted(converted, _expected(model), path, missing, unmapped)
     return params, table + checkpoint.passed_over()
+
+
+def _check_meaning(model: LstrConfig) -> None:
+    """Raise UserError for a network of ours in which LSTR's tensors, although they fit, mean something else."""
+    _check_equal("task.model", model, LstrConfig(), ("anchors", "located"))
+
+
+def _check_layers(model: LstrConfig) -> None:
+    """Raise UserError for layers in which the published tensors, although they fit, mean something else.
+
+    Heads, pre-norm and activation are options of LSTR's program: of other files they are not known.
+    """
+    layers = {"decoder": model.decoder}
+    if isinstance(model.encoder, TransformerEncoderConfig):
+        layers["encoder.layer"] = model.encoder.layer
+    for name, layer in layers.items():
+        _check_equal(f"task.model.{name}", layer, TransformerConfig(), ("heads", "norm_first", "activation"))
+
+
+def _check_equal(part: str, found: object, needed: object, names: Iterable[str]) -> None:
+    for name in names:
+        value, wanted = getattr(found, name), getattr(needed, name)
+        if value != wanted:
+            text = f"LSTR's weights mean something else where {part}.{name} is {value!r}: they need {wanted!r}"
+            raise UserError(text)
 
 
 @functools.lru_cache(maxsize=4)

@@ -97,6 +97,11 @@ def check_digest(state: Mapping[str, np.ndarray], path: Path, published: Publish
         )
 
 
+def is_published(state: Mapping[str, np.ndarray]) -> bool:
+    """Return whether tensors are those of a file of `PUBLISHED`, wherever they were read from."""
+    return digest_of(state) in {file.digest for file in PUBLISHED.values()}
+
+
 def digest_of(state: Mapping[str, np.ndarray]) -> str:
     """Return the sha256 of names, shapes and float32 values of all weights, in order of their names.
 

@@ -27,12 +27,15 @@ class MarkerLanes:
 
     Attributes:
         model: a host with a marker prior.
+        remembers: with the prior's memory, if it has one: `task.streams` of the model that is compared with, because
+            one that was trained on single frames does not use its memory.
 
     Raises:
         UserError: the host has no marker prior.
     """
 
     model: HostConfig
+    remembers: bool = True
 
     def __post_init__(self) -> None:
         if self.model.priors.markers is None:
@@ -40,12 +43,12 @@ class MarkerLanes:
 
     @property
     def streams(self) -> bool:
-        """Whether the prior has a memory."""
-        return self._prior.start() is not None
+        """Whether frames are processed in order, with the prior's memory."""
+        return self.start() is not None
 
     def start(self) -> Any:
-        """Return an empty memory."""
-        return self._prior.start()
+        """Return an empty memory, None for none."""
+        return self._prior.start() if self.remembers else None
 
     def predict(self, params: Any, example: Example) -> Prediction:
         """Return the lanes of the frame's own markers."""

@@ -76,7 +76,8 @@ class PolylineEncoderConfig:
         yield "bands", self.bands % 2 == 0, "even: every frequency has a sine and a cosine"
 
 
-# Marker fusion, section IV-C; hidden channels and dropout, which it does not give, are SMERF's.
+# Marker fusion, section IV-C. It does not give hidden channels and dropout, which are SMERF's, nor the width of the
+# transformer: a linear layer takes the 2 d = 64 channels of Eq. (1) to that of a token.
 MARKER_POLYLINES = PolylineEncoderConfig(bands=32, layout="interleaved", attend="points")
 
 

@@ -40,15 +40,16 @@ class MarkerSimulationConfig:
             grow; the error of a depth estimated from the marker's size in pixels grows with the square.
         jump: probability of an abrupt jump (paper: 0.05 a frame), on top of the other errors.
         jump_distance: of a jump, in a random direction in the ground plane, metres (paper: about 25).
-        jump_yaw: of a jump, to a random side, degrees (paper: about 90).
+        jump_yaw: of a jump, degrees (paper: about 90), to the left or right by the octant of its direction.
         jump_spread: relative standard deviation of both.
         detection_sigma: sigma_d of P = exp(-d^2 / (2 sigma_d^2)), metres. The paper fits it but does not report it. The
             default puts P = 1/2 at 47 m, where a 1 m marker is 38 pixels wide in the front camera of Argoverse 2, some
             5 pixels for each of the 7 cells of a 5x5 ArUco marker.
         range: largest distance at which a marker is visible, metres (the paper gives its errors at 60 m).
         field_of_view: full angle of view ahead, degrees.
-        cameras: the whole square must lie in the image of one of them, with the calibration of the log; None asks for
-            the field of view alone, which has no upper end.
+        cameras: the whole square must lie in the image of one of them, as mounted for the log's seed (recorded images
+            of a log have a calibration of their own, which is not used); None asks for the field of view alone, which
+            has no upper end.
         frontal: largest angle, from straight at the face, of both the line of sight and the vehicle's heading, degrees:
             a marker is visible only to a vehicle that approaches it frontally.
         occlusion: "bodies": road users, buildings, masts, signs, lamp posts and trees hide markers (needs OpenCV; of
@@ -229,7 +230,7 @@ def _perturbed(
     growth = config.growth_at(distance)
     forward, yaw, pitch, further, turned = drawn.normal.T
     yaw, pitch = growth * config.yaw_sigma * yaw, growth * config.pitch_sigma * pitch
-    # One number gives the direction of a jump and the sign of its yaw.
+    # One number gives the direction of a jump and, by its octant, the sign of its yaw.
     angle = 2.0 * np.pi * drawn.uniform[:, 3]
     length = np.where(jump, config.jump_distance * (1.0 + config.jump_spread * further), 0.0)
     side = np.where(drawn.uniform[:, 3] * 8.0 % 2.0 < 1.0, 1.0, -1.0)

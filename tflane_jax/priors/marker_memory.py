@@ -6,7 +6,9 @@ compensation of the ego motion.
 
 Slots and decay count frames, not seconds: with the frames half a second apart of training, T = 6 slots are 3 s, at
 10 Hz they are 0.6 s. A drive must be fed at the rate of training, and a pause longer than the bank is a new start
-(`tasks.marker_drive`, `tflane markers run --interval`).
+(`tasks.marker_drive`, `tflane markers run --interval`). In data sets every frame but the first of a scene continues the
+memory: key frames that are missing in between do not age it. Lanes that the motion takes out of the perception range
+stay in the bank, with coordinates outside [0, 1] in Eq. (1).
 
 Choices that the paper leaves open (the first two are options):
 

@@ -192,6 +192,10 @@ def schedule_notices(config: OptimConfig, steps: int) -> list[str]:
         notices.append(f"optim.epoch_steps: the run ends at step {steps}, before an epoch lowers the learning rate")
     if config.drops is not None and (late := [drop for drop in config.drops.steps if drop >= steps]):
         notices.append(f"optim.drops.steps: the run ends at step {steps}, before the learning rate drops at {late[0]}")
+    if config.restarts is not None:
+        first = first_cycle(config.restarts, config.warmup_steps, steps)
+        if config.warmup_steps + int(first.length) >= steps:
+            notices.append(f"optim.restarts: the run ends at step {steps}, before the learning rate restarts")
     return notices
 
 

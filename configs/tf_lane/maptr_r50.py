@@ -84,7 +84,7 @@ def ablations() -> dict[str, RunConfig]:
 LIDAR_BEV = replace(
     PAPER_MAP_ENCODER.bev,
     grid=BevGrid(range_in_lidar_axes(PAPER_RANGE), 200, 100),
-    align="bevformer",
+    align="reference",
     temporal_value="initial",
     memory="off",
     motion="can_bus",

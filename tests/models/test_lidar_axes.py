@@ -12,8 +12,10 @@ from tests.models.cases import CAMERA, LINES, SMALL_LINES, make_camera_example, 
 from tests.parameters import random_params
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import BevGrid, PerceptionRange, invert_pose, project, transform_points, yaw_pose
+from tflane_jax.layers.bev_alignment import ego_shift
 from tflane_jax.losses.map_masks import bev_line_mask, view_line_masks
 from tflane_jax.losses.maptrv2 import MapTrV2LossConfig
+from tflane_jax.models.bev_encoder import BevFormerConfig
 from tflane_jax.models.bevformer import can_bus_vector
 from tflane_jax.models.lane_denoising import DenoisingConfig
 from tflane_jax.models.lidar_axes import (
@@ -216,11 +218,32 @@ def with_cameras(range_, kind=MapTrConfig, **settings):
             {"denoising": DenoisingConfig(), "decoder": SMALL_LINES.decoder},
             "noised lines are in the ego axes",
         ),
+        ({"decoder": replace(LINES.decoder, anchors="spread")}, r"decoder\.anchors.*anchors are laid along x"),
     ],
 )
 def test_parts_without_turned_axes_are_named(changes, message):
     with pytest.raises(UserError, match=message):
         replace(with_cameras(range_in_lidar_axes(RANGE), range=RANGE, axes="lidar"), **changes).build()
+
+
+@pytest.mark.parametrize("memory", ["off", "previous"])
+def test_a_memory_is_not_turned_twice(memory):
+    """The published shift of a vehicle that drives ahead: along y of the lidar."""
+    lidar = range_in_lidar_axes(RANGE)
+    host = with_cameras(lidar, range=RANGE, axes="lidar")
+    images, levels = replace(host.encoder.images, stages=(3,)), host.encoder.images.pyramid.levels
+    bev = BevFormerConfig(host.encoder.bev.grid, dim=16, cameras=2, levels=levels, memory=memory, align="bevformer")
+    host = replace(host, encoder=replace(host.encoder, images=images, bev=bev))
+    if memory == "off":
+        host.build()
+        return
+    with pytest.raises(UserError, match=r"encoder\.bev\.align.*bevformer turns it once more"):
+        host.build()
+    ahead = np.eye(4, dtype=np.float32)
+    ahead[0, 3] = 2.0
+    turned = host.in_host_frame(make_example().replace(previous_from_ego=ahead)).previous_from_ego
+    shift = ego_shift(bev.grid, turned) * np.asarray(bev.grid.range.size(2))
+    np.testing.assert_allclose(shift, [0.0, 2.0], atol=1e-6)
 
 
 def test_the_can_bus_of_published_weights():

@@ -181,6 +181,14 @@ def test_truth_beyond_the_range_that_the_model_perceives_is_named(changes, what)
     LaneGraphTask(replace(TopoNetConfig(), range=near.range)).check_settings(WorldData())
 
 
+def test_traffic_beyond_the_bev_features_is_named():
+    model = replace(TopoNetConfig(), priors=PriorsConfig(traffic_flow=TrafficFlowConfig()))
+    far = replace(model, range=replace(model.range, x=(-80.0, 80.0)))
+    with pytest.raises(UserError, match=r"traffic flow reaches to x \(-80\.0, 80\.0\).*BEV features"):
+        LaneGraphTask(far).check_settings(WorldData())
+    LaneGraphTask(replace(far, priors=PriorsConfig())).check_settings(WorldData())
+
+
 def test_limiting_instances_needs_traffic_flow():
     with pytest.raises(UserError, match="baseline without traffic flow"):
         limit_instances(LaneGraphTask(BASELINE), 3)

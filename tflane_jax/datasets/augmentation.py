@@ -71,7 +71,7 @@ def augment(
     """Return one example with random changes; the same seed gives the same bits.
 
     Points that leave the image become invalid. Rows stay ascending within a line, and lines stay sorted from left to
-    right by their first point. A line that the warp leaves with fewer than two points is dropped.
+    right by their first point. A line of several points of which the warp leaves one or none is dropped.
 
     Args:
         example: numpy.

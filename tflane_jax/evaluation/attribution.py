@@ -67,7 +67,8 @@ class RoadUserEffects(NamedTuple):
 
     Attributes:
         road_user: (T,) index of the track in the traffic flow.
-        attention: (T,) of the lane's query to the road user, mean over heads; the sum is 1.
+        attention: (T,) of the lane's query to the road user, mean over heads; the sum is the part of the heads in
+            which the lane may attend to a road user: 1 without masks by distance.
         driven: (T,) fraction of the lane's length that the road user drove along, see `driven_fraction`.
         without: (T,) score of the lane when only this road user is removed.
     """
@@ -153,7 +154,8 @@ def traffic_attention(
         examples: single frames, stacked.
 
     Returns:
-        The last decoder layer's predictions, stacked, and the weights: each row sums to 1, without traffic to 0.
+        The last decoder layer's predictions, stacked, and the weights. Each row sums to the part of the heads in which
+        the lane may attend to a road user: 1 without masks by distance, 0 without traffic.
 
     Raises:
         UserError: lanes of this model do not attend to traffic, or share the softmax of lanes with it.

@@ -32,7 +32,8 @@ class LaneShapeLossConfig:
         shared_horizon: the target of every lane begins at the highest row of all lanes in the image, as in LSTR.
         least_depth: rows nearer to the predicted horizon than this fraction of the image height, above or below it,
             are evaluated this far below it. The curve has a pole at the horizon; with the default 1e-6 (LSTR's program
-            has no bound), training rarely recovers from a predicted horizon close to a point's row.
+            has no bound), training rarely recovers from a predicted horizon close to a point's row. Scores, files and
+            pictures have no such bound: there a lane's far end may bend that no loss sees.
         matcher: backend of `matching.match`.
     """
 

@@ -26,10 +26,10 @@ class TrafficRaster:
     """Traffic flow by BEV cell, row by row; row 0 and column 0 at the low ends.
 
     Attributes:
-        features: (Q, `CHANNELS`), 0 in cells without traffic: log(1 + frames of all road users in the cell); recency
-            of the latest of them in (0, 1], 1 for the last frame; means over them of cos and sin of the heading,
-            offset (x, y) from the cell centre in cells, moved = min(1, distance from first to last valid frame /
-            10 m), one-hot `RoadUser`.
+        features: (Q, `CHANNELS`), 0 in cells without traffic: log(1 + frames of all road users in the cell), see
+            `between`; recency of the latest of them in (0, 1], 1 for the last frame; means over them of cos and sin of
+            the heading, offset (x, y) from the cell centre in cells, moved = min(1, distance from first to last valid
+            frame / 10 m), one-hot `RoadUser`.
         touched: (Q,) cells with traffic.
     """
 
@@ -47,7 +47,8 @@ def rasterise_traffic_flow(
         coordinates: of `tracks.position`; normalised ones span the grid's range.
         grid: the cells.
         between: points interpolated between successive frames that are both valid, so that the path of a fast road
-            user has no gaps. A point counts as 1 / (between + 1) frames.
+            user has no gaps. A point counts as 1 / (between + 1) frames; so does a frame that no valid one follows,
+            because it has no points but its own.
     """
     position, valid = tracks.position[..., :2], tracks.frame_valid
     unit = jnp.where(valid[..., None], position if coordinates == "normalised" else grid.range.normalise(position), 0.0)

@@ -5,11 +5,13 @@ from __future__ import annotations
 from operator import attrgetter
 
 import numpy as np
+from jaxtyping import Float
 
 from tflane_jax.datasets.base import ExampleConfig
 from tflane_jax.datasets.data_source import LaneGraphSource
 from tflane_jax.datasets.sources import source_name
 from tflane_jax.errors import UserError
+from tflane_jax.geometry import PerceptionRange
 from tflane_jax.models.bev_encoder import BevFormerConfig
 from tflane_jax.models.bevformer import check_capacity
 from tflane_jax.models.camera_encoder import CameraEncoderConfig
@@ -105,19 +107,29 @@ def _check_ranges(model: HostConfig, config: ExampleConfig) -> None:
                 f"the evidence raster covers x {raster.x}, y {raster.y} (data.example.sensor.grid.range), and the "
                 f"model takes it for x {bev_range.x}, y {bev_range.y}: set task.model.encoder.range to the same"
             )
-    low, high = (np.array([getattr(config.range, axis)[end] for axis in "xy"]) for end in (0, 1))
-    if not bev_range.contains(np.stack([low, high])).all():
+    labelled = _corners(config.range)
+    if not bev_range.contains(labelled).all():
         raise UserError(
             f"lanes are labelled within x {config.range.x}, y {config.range.y} (data.example.range), beyond the "
             f"model's BEV features (x {bev_range.x}, y {bev_range.y}): make either range fit the other"
         )
+    if model.priors.traffic_flow is not None and not bev_range.contains(_corners(model.range)).all():
+        raise UserError(
+            f"traffic flow reaches to x {model.range.x}, y {model.range.y} (task.model.range), beyond the model's BEV "
+            f"features (x {bev_range.x}, y {bev_range.y}), in whose coordinates it is given: make either range fit"
+        )
     ends = getattr(getattr(model, "decoder", None), "output", None) == "metric"
-    if (ends or model.priors.traffic_flow is not None) and not model.range.contains(np.stack([low, high])).all():
+    if (ends or model.priors.traffic_flow is not None) and not model.range.contains(labelled).all():
         raise UserError(
             f"lanes are labelled within x {config.range.x}, y {config.range.y} (data.example.range), and the model's "
             f"{'lanes end' if ends else 'traffic flow ends'} at x {model.range.x}, y {model.range.y} "
             "(task.model.range): make either range fit the other"
         )
+
+
+def _corners(range_: PerceptionRange) -> Float[np.ndarray, "2 2"]:
+    """Return the low and the high corner of a range in the ground plane."""
+    return np.array([[getattr(range_, axis)[end] for axis in "xy"] for end in (0, 1)])
 
 
 def _check_raster(model: HostConfig, config: ExampleConfig) -> None:

@@ -23,17 +23,18 @@ Verdict = Literal["go on", "extend", "restart"]
 class AdaptiveConfig:
     """Settings of the rule.
 
-    An evaluation after `elapsed` of the `length` steps of a cycle counts if elapsed / length > `grace`. It is better
-    than an earlier one if it improves on it by more than `threshold` times the earlier value's size.
+    An evaluation after `elapsed` of the `length` steps of a cycle counts if elapsed / length > `grace`. The run and
+    each cycle have a reference: their first value that counted, then each value that improves on the reference by more
+    than `threshold` times the reference's size. Smaller gains add up until they do.
 
-    1. Extend: the evaluation is better than all that counted in the run, the cycle is in its last `fraction` but has
-       not ended, and it was extended fewer than `max_extensions` times. The rest of the cycle then takes 1 + `extend`
-       times as long, at most up to the end of the run (`RestartsConfig.last_cycle` may let it take all of that). The
-       learning rate continues without a jump. A cycle whose rest would not grow is not extended.
-    2. Restart: the last `patience` evaluations are not better than the best earlier one of this cycle, the cycle has
-       not ended, and the run has at least as many steps left as the cycle has had (so that no run ends at the high
-       rates of a new cycle). The next update begins a cycle with this one's period. From then on the peak is only
-       `shrink` times as high above the floor as before.
+    1. Extend: the evaluation improves on the run's reference so, the cycle is in its last `fraction` but has not ended,
+       and it was extended fewer than `max_extensions` times. The rest of the cycle then takes 1 + `extend` times as
+       long, at most up to the end of the run (`RestartsConfig.last_cycle` may let it take all of that). The learning
+       rate continues without a jump. A cycle whose rest would not grow is not extended.
+    2. Restart: none of the last `patience` evaluations improved on the cycle's reference so, the cycle has not ended,
+       and the run has at least as many steps left as the cycle has had (so that no run ends at the high rates of a new
+       cycle). The next update begins a cycle with this one's period. From then on the peak is only `shrink` times as
+       high above the floor as before.
 
     Attributes:
         metric: a score of the evaluation, "group/name". The scores of lane graphs have no loss: choose another one, and
@@ -64,9 +65,9 @@ class Memory:
     """What the rule remembers of one seed's evaluations; plain JSON, because checkpoints hold it.
 
     Attributes:
-        best: best value of the run, None before the first evaluation that counted.
+        best: the run's reference, None before the first evaluation that counted.
         number: the cycle that the following attributes describe.
-        cycle_best: best value of the cycle.
+        cycle_best: the cycle's reference.
         stale: evaluations since then.
         extensions: of the cycle.
     """

@@ -130,3 +130,10 @@ def test_64_bit_mode_gives_the_same(backend):
         got = jax.jit(match, static_argnums=2)(cost, valid, backend)
     assert got.query.dtype == np.int32
     jax.tree.map(np.testing.assert_array_equal, got, expected)
+
+
+def test_other_backends_are_refused():
+    """Regression: any other word was the host's."""
+    for backend in ("device", "Jax", None):
+        with pytest.raises(ValueError, match="it must be 'scipy' or 'jax'"):
+            match(jnp.zeros((3, 2)), jnp.ones(2, bool), backend)

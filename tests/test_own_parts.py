@@ -175,3 +175,16 @@ def test_data_that_fit_an_own_encoder_are_checked():
     config = with_setting(RunConfig(), "task.model.encoder", PlainEncoderConfig(cell=7))
     with pytest.raises(UserError, match=r"do not fold into blocks of 7 x 7 \(task\.model\.encoder\.cell\)"):
         check_run(config)
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("optim.lrr", r"lrr is no setting of OptimConfig: did you mean lr"),
+        ("optim.lr.x", r"x is no setting of float, which has none"),
+        ("task.model.prior", r"prior is no setting of TopoNetConfig: did you mean priors"),
+    ],
+)
+def test_names_that_are_no_settings_are_refused(name, said):
+    with pytest.raises(UserError, match=said):
+        with_setting(RunConfig(), name, 1)

@@ -5,6 +5,7 @@ import shlex
 import sys
 import types
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import cache
 from types import SimpleNamespace
 from typing import Any
@@ -159,6 +160,9 @@ def test_the_dataset_of_the_page_is_read_trained_on_and_checked(tmp_path, monkey
     check_run(config)
     loaded = config.task.load(config.data.source("train"), progress=False)
     config.task.check(config.data, loaded)
+    for wrong in (loaded.bev[:, ::2], loaded.bev[..., :3]):
+        with pytest.raises(UserError, match=r"examples of mine-train have a raster of .* says 100 x 200 x 4"):
+            config.task.check(config.data, replace(loaded, bev=wrong))
     assert loaded.lanes.successor[0, 0, 1]
     assert loaded.lanes.valid.sum() == 2
     trained = load_config("tf_lane/toponet:street")  # another box
@@ -166,7 +170,7 @@ def test_the_dataset_of_the_page_is_read_trained_on_and_checked(tmp_path, monkey
     assert names["choose"](choice).example == trained.data.example
     run = SimpleNamespace(config=trained)
     options = {"data": "mine", "root": str(tmp_path / "drives"), "openlane": None, "split": None, "data_dict": None}
-    with pytest.raises(UserError, match="a raster of 100 x 200"):
+    with pytest.raises(UserError, match="a raster of 100 x 200 x 4"):
         source_for(run, SimpleNamespace(default_split="test", **options))
 
 

@@ -23,6 +23,7 @@ from tflane_jax.runs import (
     resumable_config,
     save_weights,
     train_run,
+    write_weights,
 )
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.tasks.lane_shape import LaneShapeTask
@@ -38,9 +39,20 @@ def config(tmp_path_factory):
     return replace(config, evaluation=replace(config.evaluation, pictures=0))
 
 
+def test_parameters_of_another_model_are_not_saved(config, tmp_path, monkeypatch):
+    monkeypatch.setattr(LaneGraphTask, "init", lambda task, key, example: {"scale": jnp.ones(3)})
+    for params in ({"scale": jnp.ones(4)}, {}, {"scale": jnp.ones(3), "more": jnp.ones(1)}):
+        with pytest.raises(UserError, match=r"not those of this configuration's model: (scale|more)"):
+            save_weights(config, params, tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+    save_weights(config, {"scale": jnp.ones(3)}, str(tmp_path / "run"))
+    with pytest.raises(UserError, match=r"run is not empty: choose another folder$"):
+        save_weights(config, {"scale": jnp.ones(3)}, tmp_path / "run")
+
+
 def test_a_start_from_another_model_is_told_before_data_are_read(config, tmp_path, monkeypatch):
     """Regression: it was told once the data were built, which may take an hour."""
-    save_weights(config, {"shift": {"kernel": jnp.zeros((1, 4))}}, tmp_path / "origin")
+    write_weights(config, {"shift": {"kernel": jnp.zeros((1, 4))}}, tmp_path / "origin")
     monkeypatch.setattr(LaneGraphTask, "load", None)
     tuned = replace(config, training=replace(config.training, init_from=str(tmp_path / "origin")))
     with pytest.raises(UserError, match=r"origin holds another model \(.* there, .* here\)"):
@@ -51,7 +63,7 @@ def test_a_start_from_another_model_is_told_before_data_are_read(config, tmp_pat
 def test_a_run_that_is_overwritten_is_none_to_start_from(config, tmp_path):
     """Regression: it was deleted first, and no checkpoint was left if the training ended before its own first one."""
     folder, link = tmp_path / "run_0", tmp_path / "link_0"
-    save_weights(config, {"scale": jnp.ones(3)}, folder)
+    write_weights(config, {"scale": jnp.ones(3)}, folder)
     link.symlink_to(folder)
     for origin in (folder, link, tmp_path / "run_{seed}"):
         tuned = replace(config, training=replace(config.training, init_from=str(origin)))
@@ -119,7 +131,7 @@ def test_a_configuration_that_was_edited_to_another_model_is_named(config, tmp_p
     init = lambda task, key, example: {"shift": {"kernel": jnp.zeros((1, width(task)))}}  # noqa: E731
     monkeypatch.setattr(LaneGraphTask, "init", init)
     folder = tmp_path / "run"
-    save_weights(config, init(config.task, None, None), folder)
+    write_weights(config, init(config.task, None, None), folder)
     (path,) = (folder / "checkpoints").glob("*/manifest.json")
     content = json.loads(path.read_text())
     content["config"]["data"]["val"] += 1
@@ -127,7 +139,7 @@ def test_a_configuration_that_was_edited_to_another_model_is_named(config, tmp_p
     assert open_run(folder).config.data.val == config.data.val + 1  # the same model
 
     content["config"]["task"]["model"]["decoder"]["queries"] += 1
-    message = r"step_00000000: shift/kernel is float32\[1, 3\] in the checkpoint and float32\[1, 5\] in the model"
+    message = r"step_00000000: shift/kernel is float32\[1, 3\], and float32\[1, 5\] in the model"
     for progress in (content["progress"], {}):
         path.write_text(json.dumps(content | {"progress": progress}))
         with pytest.raises(UserError, match=message):
@@ -140,14 +152,14 @@ def test_a_configuration_that_was_edited_to_another_model_is_named(config, tmp_p
         raise ScopeParamShapeError("kernel", "/shift", (1, 5), (1, 3))
 
     monkeypatch.setattr(LaneGraphTask, "evaluate", evaluate)
-    with pytest.raises(UserError, match=r"shift/kernel is float32\[1, 3\] .* undo that \(config\.txt"):
+    with pytest.raises(UserError, match=r"shift/kernel is float32\[1, 3\], .* undo that \(config\.txt"):
         evaluate_run(run, config.data.source("test"), progress=False)
 
 
 def test_changes_of_a_runs_configuration_that_have_no_effect_are_told(config, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(LaneGraphTask, "init", lambda task, key, example: {"scale": jnp.ones(3)})
     folder = tmp_path / "run"
-    save_weights(config, {"scale": jnp.ones(3)}, folder)
+    write_weights(config, {"scale": jnp.ones(3)}, folder)
     open_run(folder)
     saved = to_json(config)
     here = saved | {"training": saved["training"] | {"shard_state": not saved["training"]["shard_state"]}}
@@ -217,5 +229,5 @@ def test_the_scores_that_an_evaluation_gives_are_known_before(config, tmp_path):
 def test_parameters_that_are_not_finite_are_not_saved(tmp_path):
     params = {"scale": jnp.ones(3), "shift": {"kernel": jnp.array([1.0, jnp.nan])}}
     with pytest.raises(UserError, match="parameter shift/kernel holds a number that is not finite"):
-        save_weights(RunConfig(), params, tmp_path / "run")
+        write_weights(RunConfig(), params, tmp_path / "run")
     assert not (tmp_path / "run").exists()

@@ -267,8 +267,16 @@ def choices(config: Any, name: str) -> dict[str, Any]:
 
 
 def with_setting(config: T, name: str, value: Any) -> T:
-    """Return the configuration with one setting, named with dots, replaced."""
+    """Return the configuration with one setting, named with dots, replaced; `limits.check_settings` checks values.
+
+    Raises UserError for a name that is no setting.
+    """
     first, _, rest = name.partition(".")
+    names = [each.name for each in dataclasses.fields(config)] if dataclasses.is_dataclass(config) else []
+    if first not in names:
+        close = difflib.get_close_matches(first, names, 3)
+        hint = f": did you mean {' or '.join(close)}?" if close else f", which has {', '.join(names) or 'none'}"
+        raise UserError(f"{first} is no setting of {type(config).__name__}{hint}")
     changes: dict[str, Any] = {first: with_setting(getattr(config, first), rest, value) if rest else value}
     return dataclasses.replace(config, **changes)  # pyright: ignore[reportArgumentType, reportCallIssue]
 

@@ -12,7 +12,7 @@ Where a batch is divided among devices, each device (or its host) solves the pro
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import jax
 import jax.numpy as jnp
@@ -22,6 +22,8 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from tflane_jax.devices import DATA_AXIS
+
+Backend = Literal["scipy", "jax"]
 
 _COST_LIMIT = 1e6
 
@@ -39,9 +41,7 @@ class Assignment:
     matched: Bool[Array, "*b n"]
 
 
-def match(
-    cost: Float[Array, "*b q n"], valid: Bool[Array, "*#b n"], backend: Literal["scipy", "jax"] = "jax"
-) -> Assignment:
+def match(cost: Float[Array, "*b q n"], valid: Bool[Array, "*#b n"], backend: Backend = "jax") -> Assignment:
     """Return the assignment of minimum total cost between queries and valid targets; no gradient flows.
 
     Args:
@@ -49,7 +49,11 @@ def match(
             counts as 1e6, so that a diverging model fails at the loss and not here.
         valid: False for padding; its leading axes broadcast against those of the costs.
         backend: "scipy" runs on the host, "jax" on the device.
+
+    Raises ValueError for another backend.
     """
+    if backend not in get_args(Backend):
+        raise ValueError(f"backend is {backend!r}: it must be {' or '.join(map(repr, get_args(Backend)))}")
     cost = lax.stop_gradient(cost).astype(jnp.float32)
     cost = jnp.nan_to_num(jnp.clip(cost, -_COST_LIMIT, _COST_LIMIT), nan=_COST_LIMIT)
     valid = jnp.broadcast_to(valid, (*cost.shape[:-2], cost.shape[-1]))

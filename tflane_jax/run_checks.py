@@ -90,17 +90,25 @@ def training_shapes(task: AnyTask, example: Any) -> Any:
     return example if task.frames == 1 else shapes_of(example, task.frames)
 
 
-def check_model(config: RunConfig, params: Params, place: str) -> None:
+def check_model(config: RunConfig, params: Params, checkpoint: str | None = None) -> None:
     """Raise UserError, naming the first difference, if parameters are not those of the model of a configuration.
 
     No-op without the data of the configuration, which the shapes of some parameters depend on.
+
+    Args:
+        config: of the model.
+        params: with running statistics.
+        checkpoint: that holds both; None for parameters of the caller.
     """
     shapes = _known_shapes(config)
-    if shapes is not None and (difference := first_misfit(params, shapes)):
-        raise UserError(
-            f"{place}: {difference}. Its configuration was changed after the training: undo that (config.txt in the "
-            "run folder has the settings that the run was started with), or train the other model"
-        )
+    if shapes is None or not (difference := first_misfit(params, shapes)):
+        return
+    if checkpoint is None:
+        raise UserError(f"the parameters are not those of this configuration's model: {difference}")
+    raise UserError(
+        f"{checkpoint}: {difference}. Its configuration was changed after the training: undo that (config.txt in the "
+        "run folder has the settings that the run was started with), or train the other model"
+    )
 
 
 def check_origin_model(config: RunConfig) -> None:

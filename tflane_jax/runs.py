@@ -249,13 +249,24 @@ def open_weights(config: RunConfig) -> Run:
     return Run(str(config.weights), replace(config, training=replace(config.training, seeds=(0,))), 0, (params,))
 
 
-def save_weights(config: RunConfig, params: Params, folder: Path, *, part: str | None = None) -> None:
+def save_weights(config: RunConfig, params: Params, folder: Path | str) -> None:
     """Write a run folder at step 0 with the given parameters, usable like a trained run.
 
-    With `part`, the path of a module, they are that module's alone, and the folder is one to start training from.
-
-    Raises UserError if the folder is not empty, or a parameter is not finite.
+    Raises UserError if the folder is not empty, a parameter is not finite, or they are not those of the configuration's
+    model (not checked without the data of the configuration, which the shapes of some parameters depend on).
     """
+    check_model(config, params)
+    write_weights(config, params, folder)
+
+
+def write_weights(config: RunConfig, params: Params, folder: Path | str, *, part: str | None = None) -> None:
+    """Write a run folder like `save_weights`, of parameters that are known to fit the model.
+
+    With `part`, the path of a module, they are that module's alone, and the folder is one to start training from.
+    """
+    folder = Path(folder)
+    if folder.is_dir() and any(folder.iterdir()):
+        raise UserError(f"{folder} is not empty: choose another folder")
     for path, leaf in jax.tree_util.tree_leaves_with_path(params):
         if not np.isfinite(leaf).all():
             name = jax.tree_util.keystr(path, simple=True, separator="/")

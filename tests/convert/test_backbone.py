@@ -15,7 +15,7 @@ from tflane_jax.convert.backbone import PART, is_backbone, load_backbone
 from tflane_jax.errors import UserError
 from tflane_jax.layers.batch_norm import STATISTICS
 from tflane_jax.layers.resnet import ResNetConfig
-from tflane_jax.runs import open_run, save_weights, train_run
+from tflane_jax.runs import open_run, train_run, write_weights
 from tflane_jax.tasks.fit import frozen_modules
 from tflane_jax.training.fine_tuning import starting_params
 
@@ -124,7 +124,7 @@ def test_a_run_starts_from_the_backbone_alone(file, tmp_path):
     """Every seed keeps its own fresh parameters elsewhere; such a folder cannot be evaluated."""
     model, folder = host(stages=(0, 1)), tmp_path / "imagenet"
     params, _ = load_backbone(file, model)
-    save_weights(RunConfig(task=replace(RunConfig().task, model=model)), params, folder, part=PART)
+    write_weights(RunConfig(task=replace(RunConfig().task, model=model)), params, folder, part=PART)
     with pytest.raises(UserError, match=rf"holds the weights of {PART} alone"):
         open_run(folder)
     states = []
@@ -158,7 +158,7 @@ def test_the_command_says_how_to_train_from_it(file, tmp_path, capsys, monkeypat
     monkeypatch.setattr(
         "tflane_jax.commands.convert.load_config", lambda name: RunConfig(replace(task(), model=host()))
     )
-    monkeypatch.setattr("tflane_jax.commands.convert.save_weights", lambda *a, **more: written.append(more))
+    monkeypatch.setattr("tflane_jax.commands.convert.write_weights", lambda *a, **more: written.append(more))
     assert main(["convert", "--config", "x", "--weights", str(file), "--out", str(tmp_path / "out")]) == 0
     said = capsys.readouterr().out
     assert f"it holds {PART} alone; train from it: --training.init-from {tmp_path / 'out'}" in said

@@ -89,7 +89,7 @@ def model(folder: Path) -> Path:
 
     from tests.fakes import fake_prediction
     from tflane_jax.config import RunConfig
-    from tflane_jax.runs import save_weights
+    from tflane_jax.runs import write_weights
     from tflane_jax.scene import Prediction
     from tflane_jax.tasks.lane_graph import LaneGraphTask
 
@@ -97,7 +97,7 @@ def model(folder: Path) -> Path:
         return Prediction(centerlines=jax.tree.map(jnp.asarray, fake_prediction(0)))
 
     LaneGraphTask.predict = predict  # pyright: ignore[reportAttributeAccessIssue]
-    save_weights(RunConfig(), {"shift": jnp.zeros(3)}, folder / "run")
+    write_weights(RunConfig(), {"shift": jnp.zeros(3)}, folder / "run")
     return folder / "run"
 
 

@@ -7,6 +7,7 @@ import pytest
 
 from tflane_jax.errors import UserError
 from tflane_jax.metrics.centerline_matching import match_frame
+from tflane_jax.metrics.f_score import CenterlineFScore
 from tflane_jax.metrics.frames import LaneDetections, LaneTruth
 from tflane_jax.metrics.groups import GroupedMetrics
 from tflane_jax.metrics.lane_segment import LaneSegmentMetrics
@@ -43,6 +44,13 @@ def grouped(**further):
 def test_other_arguments_are_refused(make, said):
     with pytest.raises(UserError, match=said):
         make()
+
+
+@pytest.mark.parametrize("metric", [CenterlineMetrics, CenterlineFScore, grouped])
+def test_swapped_arguments_are_named(metric):
+    found, truth = lanes()
+    with pytest.raises(UserError, match=r"LaneTruth and LaneDetections are given: detections \(LaneDetections\) come"):
+        metric().update(truth, found)
 
 
 @pytest.mark.parametrize(

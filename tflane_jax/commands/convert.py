@@ -18,7 +18,7 @@ from tflane_jax.convert.torch_file import read_checkpoint
 from tflane_jax.convert.weights_files import lane_graph_weights
 from tflane_jax.errors import UserError
 from tflane_jax.plots.tables import format_table, save_table
-from tflane_jax.runs import save_weights
+from tflane_jax.runs import write_weights
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.training.runtime import configure_jax
 
@@ -71,10 +71,10 @@ def convert(
             raise UserError(f"--edge-weight is of GTN encoders: {weights} is a backbone, leave it out")
         part = BACKBONE
         params, table = load_backbone(weights, config.task.model, entry)
-        save_weights(config, params, out, part=part)
+        write_weights(config, params, out, part=part)
     else:
         params, table = load_weights(weights, config.task, "fresh", edge_weight, entry)
-        save_weights(replace(config, weights=weights), params, out)
+        write_weights(replace(config, weights=weights), params, out)
     title = f"{weights}: every tensor and what becomes of it"
     save_table(out / _TABLE, table, {"weights": str(weights)}, title=title)
     return table, title, part

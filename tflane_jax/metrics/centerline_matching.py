@@ -17,6 +17,7 @@ from tflane_jax.metrics.frames import (
     ElementTruth,
     LaneDetections,
     LaneTruth,
+    check_kinds,
     check_shape,
     checked_confidence,
     checked_edges,
@@ -133,6 +134,7 @@ def match_frame(detections: LaneDetections, truth: LaneTruth, versions: Sequence
 
     Raises UserError for arrays that do not fit together.
     """
+    check_kinds(detections, truth, (LaneDetections, LaneTruth))
     true_points, points = checked_lines(truth.points, "truth"), checked_lines(detections.points, "detections")
     return match_lanes(detections, truth, *nearest_lanes(true_points, points), versions)
 

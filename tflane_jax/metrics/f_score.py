@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from tflane_jax.metrics.chamfer import PaddedLines
-from tflane_jax.metrics.frames import LaneDetections, LaneTruth, Lines
+from tflane_jax.metrics.frames import LaneDetections, LaneTruth, Lines, check_kinds
 from tflane_jax.metrics.merging import joined
 
 SAMPLES = np.arange(-50.0, 50.0)  # x of the planes, metres
@@ -35,6 +35,7 @@ class CenterlineFScore:
 
     def update(self, detections: LaneDetections, truth: LaneTruth) -> None:
         """Add one frame; raise UserError for lines that cannot be measured."""
+        check_kinds(detections, truth, (LaneDetections, LaneTruth))
         true, found = sample_lanes(truth.points, "truth"), sample_lanes(detections.points, "detections")
         recalled, precise = found_lanes(true, found)
         self._counts += [recalled, precise, len(true.points), len(found.points)]

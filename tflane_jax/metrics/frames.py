@@ -103,6 +103,14 @@ def checked_lines(lines: Lines, what: str, dims: int = 3) -> Float[np.ndarray, "
     return points
 
 
+def check_kinds(detections: Any, truth: Any, kinds: tuple[type, type]) -> None:
+    """Raise UserError for arguments of an `update` that are swapped; `kinds` are those of detections and truth."""
+    found, true = kinds
+    if isinstance(detections, true) or isinstance(truth, found):
+        given = f"{type(detections).__name__} and {type(truth).__name__}"
+        raise UserError(f"{given} are given: detections ({found.__name__}) come first, then truth ({true.__name__})")
+
+
 def one_of(name: str, value: T, allowed: Any) -> T:
     """Return an argument that is a `Literal`; raise UserError, with what is allowed, for any other value."""
     if value not in get_args(allowed):

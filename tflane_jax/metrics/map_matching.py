@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 from tflane_jax.errors import UserError
 from tflane_jax.metrics.buffers import buffers_touch
 from tflane_jax.metrics.chamfer import PaddedLines, near_pairs, pair_chamfer
-from tflane_jax.metrics.frames import Lines, check_shape, checked_numbers
+from tflane_jax.metrics.frames import Lines, check_kinds, check_shape, checked_numbers
 from tflane_jax.metrics.map_overlap import OVERLAP_DISTANCES, map_overlap
 from tflane_jax.metrics.matching import greedy_match, nearest_truth
 
@@ -127,6 +127,7 @@ def match_map(
         nearest: of detections beyond the largest threshold, or without overlap: "close" leaves it arbitrary, "all"
             finds it by the Chamfer distance of every `_COARSE`-th vertex.
     """
+    check_kinds(detections, truth, (MapDetections, MapTruth))
     true = PaddedLines.of(truth.points, "truth", dims)
     possible = (0, len(LINE_CLASSES) - 1)
     true_classes = checked_numbers(truth.classes, len(true), possible, "truth: classes")

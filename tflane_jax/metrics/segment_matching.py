@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 from tflane_jax.errors import UserError
 from tflane_jax.metrics.centerline_matching import LANE_THRESHOLDS, MatchedFrame, match_lanes, relaxation
 from tflane_jax.metrics.chamfer import PaddedLines, near_pairs, pair_chamfer
-from tflane_jax.metrics.frames import LaneDetections, LaneTruth, Lines, check_shape, checked_numbers
+from tflane_jax.metrics.frames import LaneDetections, LaneTruth, Lines, check_kinds, check_shape, checked_numbers
 from tflane_jax.metrics.frechet import end_distance, pair_frechet
 from tflane_jax.metrics.matching import greedy_match, nearest_truth
 
@@ -154,6 +154,7 @@ def match_segments(
 
     Groups of segments need the `nearest` segment of "all" detections, see `nearest_segments`.
     """
+    check_kinds(detections, truth, (SegmentDetections, SegmentTruth))
     true = [truth.lanes.points, truth.left, truth.right]
     found = [detections.lanes.points, detections.left, detections.right]
     distance, owner = nearest_segments(true, found, nearest=nearest)

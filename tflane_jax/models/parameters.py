@@ -34,7 +34,7 @@ def first_misfit(params: Params, expected: Params) -> str | None:
     for name in sorted(found.keys() | wanted.keys()):
         here, there = (_shape(tree.get(name)) for tree in (found, wanted))
         if here != there:
-            return f"{name} is {here} in the checkpoint and {there} in the model of its configuration"
+            return f"{name} is {here}, and {there} in the model of its configuration"
     return None
 
 

@@ -18,7 +18,7 @@ from tflane_jax.models.camera_encoder import CameraEncoderConfig
 from tflane_jax.models.evidence_encoder import EvidenceEncoderConfig
 from tflane_jax.models.host import HostConfig
 from tflane_jax.models.lift import LiftConfig
-from tflane_jax.scene import Example
+from tflane_jax.scene import BevChannel, Example
 
 
 def check_settings_fit(model: HostConfig, config: ExampleConfig, *, image_scale: float | None) -> None:
@@ -64,11 +64,12 @@ def check_raster(source: LaneGraphSource, example: Example) -> None:
     """Raise UserError where the evidence of an example has not the size that its source says: it is of another box."""
     if example.bev is None or (sensor := source.example.sensor) is None:
         return
-    (rows, columns, *_), grid = example.bev.shape, sensor.grid
-    if (rows, columns) != (grid.rows, grid.columns):
+    found, wanted = example.bev.shape, (sensor.grid.rows, sensor.grid.columns, len(BevChannel))
+    if found != wanted:
+        sizes = [" x ".join(map(str, shape)) for shape in (found, wanted)]
         raise UserError(
-            f"examples of {source_name(source)} have a raster of {rows} x {columns}, and their configuration says "
-            f"{grid.rows} x {grid.columns} (example.sensor.grid): a dataset makes examples of the sizes in `example`"
+            f"examples of {source_name(source)} have a raster of {sizes[0]}, and their configuration says {sizes[1]} "
+            "(rows and columns of example.sensor.grid, channels): a dataset makes examples of the sizes in `example`"
         )
 
 

@@ -41,7 +41,7 @@ from tflane_jax.models.toponet import TopoNetConfig
 from tflane_jax.scene import Example, Prediction, shapes_of, stack_examples
 from tflane_jax.tasks import score_names
 from tflane_jax.tasks.base import Draw, Model, Recorded, Task, spread
-from tflane_jax.tasks.fit import check_fit, check_settings_fit, frozen_modules, reads_traffic
+from tflane_jax.tasks.fit import check_fit, check_raster, check_settings_fit, frozen_modules, reads_traffic
 from tflane_jax.tasks.lane_pictures import draw_differences, draw_examples, draw_hidden_lanes
 
 T = TypeVar("T")
@@ -218,7 +218,10 @@ class LaneGraphTask(Task[Example, Example | Streamed, LaneGraphSource, HostMemor
     def check(self, data: SplitData, train: Example | Streamed) -> None:
         """Raise UserError where data and model do not fit together, see `tasks.fit`."""
         self.check_settings(data)
-        check_fit(self.model, first_example(train))
+        source, example = data.source("train"), first_example(train)
+        if not sources.is_shipped(sources.source_of(source)):
+            check_raster(source, example)
+        check_fit(self.model, example)
 
     def check_settings(self, data: SplitData) -> None:
         """Raise UserError where settings of data and model do not fit together, see `tasks.fit`."""

@@ -94,7 +94,8 @@ def check_unchanged(folder: Path, resolved: dict[str, Any], current_form: Curren
         saved, notices = current_form(saved)
     if found := difference(saved):
         raise UserError(
-            f"{folder} was started with another configuration ({found}): resume it as it is, or start another run"
+            f"{folder} was started with another configuration ({found}): resume it as it is, or start another run from "
+            "its weights (training.init_from)"
         )
     checkpoints = Checkpoints(folder / "checkpoints")
     for step in checkpoints.steps()[-1:]:

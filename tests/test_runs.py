@@ -46,7 +46,7 @@ def test_parameters_of_another_model_are_not_saved(config, tmp_path, monkeypatch
             save_weights(config, params, tmp_path / "run")
     assert not (tmp_path / "run").exists()
     save_weights(config, {"scale": jnp.ones(3)}, str(tmp_path / "run"))
-    with pytest.raises(UserError, match=r"run is not empty: choose another folder$"):
+    with pytest.raises(UserError, match=r"run already holds a run: choose another folder, or delete that one$"):
         save_weights(config, {"scale": jnp.ones(3)}, tmp_path / "run")
 
 

@@ -255,6 +255,8 @@ def save_weights(config: RunConfig, params: Params, folder: Path | str) -> None:
     Raises UserError if the folder is not empty, a parameter is not finite, or they are not those of the configuration's
     model (not checked without the data of the configuration, which the shapes of some parameters depend on).
     """
+    if (Path(folder) / "config.json").exists():
+        raise UserError(f"{folder} already holds a run: choose another folder, or delete that one")
     check_model(config, params)
     write_weights(config, params, folder)
 
@@ -265,8 +267,6 @@ def write_weights(config: RunConfig, params: Params, folder: Path | str, *, part
     With `part`, the path of a module, they are that module's alone, and the folder is one to start training from.
     """
     folder = Path(folder)
-    if folder.is_dir() and any(folder.iterdir()):
-        raise UserError(f"{folder} is not empty: choose another folder")
     for path, leaf in jax.tree_util.tree_leaves_with_path(params):
         if not np.isfinite(leaf).all():
             name = jax.tree_util.keystr(path, simple=True, separator="/")

@@ -218,7 +218,7 @@ def with_cameras(range_, kind=MapTrConfig, **settings):
             {"denoising": DenoisingConfig(), "decoder": SMALL_LINES.decoder},
             "noised lines are in the ego axes",
         ),
-        ({"decoder": replace(LINES.decoder, anchors="spread")}, r"decoder\.anchors.*anchors are laid along x"),
+        ({"decoder": replace(LINES.decoder, anchors="spread")}, r"decoder\.anchors.*anchors lie along x"),
     ],
 )
 def test_parts_without_turned_axes_are_named(changes, message):

@@ -150,14 +150,12 @@ class MapTrConfig(HostConfig):
             yield "axes", seen, "ego: BEV evidence is a raster in the ego axes"
             yield "denoising", self.denoising is None, "None with axes lidar: noised lines are in the ego axes"
             yield "priors.markers", self.priors.markers is None, "None with axes lidar: markers are in the ego axes"
-            ahead = self.decoder.anchors != "spread"
-            yield "decoder.anchors", ahead, "not spread with axes lidar: anchors are laid along x, which is ahead"
+            laid = "not spread with axes lidar: these anchors lie along x, which is ahead in the ego axes"
+            yield "decoder.anchors", self.decoder.anchors != "spread", laid
             bev = getattr(self.encoder, "bev", None)
             turned = isinstance(bev, BevFormerConfig) and bev.memory != "off" and bev.align == "bevformer"
-            reason = (
-                "reference or warp: the motion is already given in the lidar's axes, and bevformer turns it once more"
-            )
-            yield "encoder.bev.align", not turned, reason
+            wanted = "reference or warp: the motion is in the lidar's axes already, and bevformer turns it once more"
+            yield "encoder.bev.align", not turned, wanted
         yield from super().limits()
 
 

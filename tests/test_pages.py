@@ -23,7 +23,7 @@ from tflane_jax.commands.sources import source_for
 from tflane_jax.config import RunConfig, load_config
 from tflane_jax.config_overrides import apply_overrides
 from tflane_jax.datasets import sources
-from tflane_jax.datasets.base import ExampleConfig
+from tflane_jax.datasets.base import ExampleConfig, TruncationWarning
 from tflane_jax.datasets.procedural import STREET_EXAMPLE
 from tflane_jax.errors import UserError
 from tflane_jax.layers.batch_norm import STATISTICS
@@ -163,6 +163,9 @@ def test_the_dataset_of_the_page_is_read_trained_on_and_checked(tmp_path, monkey
     for wrong in (loaded.bev[:, ::2], loaded.bev[..., :3]):
         with pytest.raises(UserError, match=r"examples of mine-train have a raster of .* says 100 x 200 x 4"):
             config.task.check(config.data, replace(loaded, bev=wrong))
+    lanes = loaded.lanes.replace(points=2.0 * loaded.lanes.points)  # 60 m ahead, in a box of 50
+    with pytest.warns(TruncationWarning, match=r"of the points of lanes in mine-train lie outside x \(-5.*cut lanes"):
+        config.task.check(config.data, replace(loaded, lanes=lanes))
     assert loaded.lanes.successor[0, 0, 1]
     assert loaded.lanes.valid.sum() == 2
     trained = load_config("tf_lane/toponet:street")  # another box

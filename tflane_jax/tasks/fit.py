@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import warnings
 from operator import attrgetter
 
 import numpy as np
 from jaxtyping import Float
 
-from tflane_jax.datasets.base import ExampleConfig
+from tflane_jax.datasets.base import ExampleConfig, TruncationWarning
 from tflane_jax.datasets.data_source import LaneGraphSource
 from tflane_jax.datasets.sources import source_name
 from tflane_jax.errors import UserError
@@ -19,6 +20,9 @@ from tflane_jax.models.evidence_encoder import EvidenceEncoderConfig
 from tflane_jax.models.host import HostConfig
 from tflane_jax.models.lift import LiftConfig
 from tflane_jax.scene import BevChannel, Example
+
+_BORDER = 0.1
+"""Metres by which a point may lie outside a range, for rounding."""
 
 
 def check_settings_fit(model: HostConfig, config: ExampleConfig, *, image_scale: float | None) -> None:
@@ -71,6 +75,23 @@ def check_raster(source: LaneGraphSource, example: Example) -> None:
             f"examples of {source_name(source)} have a raster of {sizes[0]}, and their configuration says {sizes[1]} "
             "(rows and columns of example.sensor.grid, channels): a dataset makes examples of the sizes in `example`"
         )
+
+
+def warn_of_lanes_beyond(source: LaneGraphSource, examples: Example) -> None:
+    """Warn of lanes, of one example or of many, that leave the range in which a model is to predict them."""
+    range_ = source.example.range
+    low, high = _corners(range_)
+    for name, lanes in (("lanes", examples.lanes), ("segments", examples.segments)):
+        points = np.asarray(lanes.points)[np.asarray(lanes.valid)][..., :2]
+        beyond = ((points < low - _BORDER) | (points > high + _BORDER)).any(-1)
+        if beyond.any():
+            warnings.warn(
+                f"{100 * beyond.mean():.2g} % of the points of {name} in {source_name(source)} lie outside x "
+                f"{range_.x}, y {range_.y} (example.range), where a model is not made to put them: cut lanes at the "
+                "border (geometry.clip_to_range)",
+                TruncationWarning,
+                stacklevel=3,
+            )
 
 
 def _check_elements(model: HostConfig, example: Example) -> None:

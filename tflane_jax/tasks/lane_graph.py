@@ -41,7 +41,14 @@ from tflane_jax.models.toponet import TopoNetConfig
 from tflane_jax.scene import Example, Prediction, shapes_of, stack_examples
 from tflane_jax.tasks import score_names
 from tflane_jax.tasks.base import Draw, Model, Recorded, Task, spread
-from tflane_jax.tasks.fit import check_fit, check_raster, check_settings_fit, frozen_modules, reads_traffic
+from tflane_jax.tasks.fit import (
+    check_fit,
+    check_raster,
+    check_settings_fit,
+    frozen_modules,
+    reads_traffic,
+    warn_of_lanes_beyond,
+)
 from tflane_jax.tasks.lane_pictures import draw_differences, draw_examples, draw_hidden_lanes
 
 T = TypeVar("T")
@@ -221,6 +228,7 @@ class LaneGraphTask(Task[Example, Example | Streamed, LaneGraphSource, HostMemor
         source, example = data.source("train"), first_example(train)
         if not sources.is_shipped(sources.source_of(source)):
             check_raster(source, example)
+            warn_of_lanes_beyond(source, example if isinstance(train, Streamed) else train)
         check_fit(self.model, example)
 
     def check_settings(self, data: SplitData) -> None:

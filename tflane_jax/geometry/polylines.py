@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float, Int
 
+from tflane_jax.geometry.namespace import ArrayT, namespace
 from tflane_jax.geometry.ranges import PerceptionRange
 
 
@@ -110,19 +111,20 @@ def pad_lines(
 
 
 def segment_distances(
-    points: Float[np.ndarray, "*#b 2"], start: Float[np.ndarray, "*#b m 2"], step: Float[np.ndarray, "*#b m 2"]
-) -> tuple[Float[np.ndarray, "*b m"], Float[np.ndarray, "*b m"]]:
+    points: Float[ArrayT, "*#b 2"], start: Float[ArrayT, "*#b m 2"], step: Float[ArrayT, "*#b m 2"]
+) -> tuple[Float[ArrayT, "*b m"], Float[ArrayT, "*b m"]]:
     """Return where on each straight piece `start` to `start + step` each point is nearest, and the distances.
 
     The first result is the fraction of the piece, in [0, 1]. A piece may have no length.
     """
+    xp = namespace(points, start, step)
     # x and y apart: four times faster than sums over the last axis, with the same bits (hence `+ 0.0`, for -0.0).
     square = (step**2).sum(-1)
     away_x, away_y = (points[..., None, axis] - start[..., axis] for axis in (0, 1))
     along = away_x * step[..., 0] + away_y * step[..., 1]
-    t = np.clip(along / np.where(square > 0.0, square, 1.0), 0.0, 1.0) + 0.0
+    t = xp.clip(along / xp.where(square > 0.0, square, 1.0), 0.0, 1.0) + 0.0
     x, y = (start[..., axis] + t * step[..., axis] - points[..., None, axis] for axis in (0, 1))
-    return t, np.sqrt(x * x + y * y)
+    return t, xp.sqrt(x * x + y * y)
 
 
 def line_distances(

@@ -7,12 +7,13 @@ in numpy or under jit, depending on the arrays.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from flax import struct
 from jaxtyping import Bool, Float
 
+from tflane_jax.geometry import segment_distances
 from tflane_jax.geometry.namespace import namespace
 from tflane_jax.limits import Count, Positive, counted
 from tflane_jax.scene import MarkerObservations
@@ -107,7 +108,9 @@ def select_marker_lanes(markers: MarkerObservations, config: MarkerPriorConfig) 
     edges = xp.broadcast_to(markers.successor[:, :, None, :], (count, lanes, count, lanes))
     edges = edges.reshape(count * lanes, count * lanes) & same & valid[:, None] & valid[None, :]
     trust = xp.where(valid, xp.repeat(marker_confidence(markers, config), lanes), 0.0)
-    near = _squared_distance(flat, xp)
+    # To the lines, not to their points, which may be 10 m apart.
+    vehicle, start = xp.zeros((1, 2), flat.dtype), flat[:, :-1]
+    near = segment_distances(vehicle, start, flat[:, 1:] - start)[1].min(-1)
     # Stable: lanes of one marker keep their order if all have a place; padding comes last.
     near = xp.where(valid.sum() > config.lanes, near, 0.0)
     order = xp.lexsort((near, xp.where(valid, -trust, xp.inf)))[: config.lanes]
@@ -118,14 +121,6 @@ def select_marker_lanes(markers: MarkerObservations, config: MarkerPriorConfig) 
         successor=xp.pad(edges[order][:, order], ((0, missing), (0, missing))),
         valid=xp.pad(valid[order], (0, missing)),
     )
-
-
-def _squared_distance(lines: Float[Array, "n p 2"], xp: Any) -> Float[Array, " n"]:
-    """Return the squared distance of the vehicle from each line, not from its vertices: those may be 10 m apart."""
-    start, along = lines[:, :-1], lines[:, 1:] - lines[:, :-1]
-    square = xp.square(along).sum(-1)
-    fraction = xp.clip(-(start * along).sum(-1) / xp.where(square > 0, square, 1.0), 0.0, 1.0)
-    return xp.square(start + fraction[..., None] * along).sum(-1).min(-1)
 
 
 def stride(points: int, kept: int) -> np.ndarray:

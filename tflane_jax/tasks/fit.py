@@ -151,7 +151,7 @@ def _check_ranges(model: HostConfig, config: ExampleConfig) -> None:
 
 def _corners(range_: PerceptionRange) -> Float[np.ndarray, "2 2"]:
     """Return the low and the high corner of a range in the ground plane."""
-    return np.array([[getattr(range_, axis)[end] for axis in "xy"] for end in (0, 1)])
+    return np.stack([range_.x, range_.y], -1)
 
 
 def _check_raster(model: HostConfig, config: ExampleConfig) -> None:

@@ -33,7 +33,7 @@ class LaneShapeLossConfig:
         least_depth: rows nearer to the predicted horizon than this fraction of the image height, above or below it,
             are evaluated this far below it. The curve has a pole at the horizon; with the default 1e-6 (LSTR's program
             has no bound), training rarely recovers from a predicted horizon close to a point's row. Scores, files and
-            pictures have no such bound: there a lane's far end may bend that no loss sees.
+            pictures have no such bound: the far end of a lane may bend in them where the loss saw no error.
         matcher: backend of `matching.match`.
     """
 

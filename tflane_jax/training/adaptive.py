@@ -27,14 +27,14 @@ class AdaptiveConfig:
     each cycle have a reference: their first value that counted, then each value that improves on the reference by more
     than `threshold` times the reference's size. Smaller gains add up until they do.
 
-    1. Extend: the evaluation improves on the run's reference so, the cycle is in its last `fraction` but has not ended,
-       and it was extended fewer than `max_extensions` times. The rest of the cycle then takes 1 + `extend` times as
-       long, at most up to the end of the run (`RestartsConfig.last_cycle` may let it take all of that). The learning
-       rate continues without a jump. A cycle whose rest would not grow is not extended.
-    2. Restart: none of the last `patience` evaluations improved on the cycle's reference so, the cycle has not ended,
-       and the run has at least as many steps left as the cycle has had (so that no run ends at the high rates of a new
-       cycle). The next update begins a cycle with this one's period. From then on the peak is only `shrink` times as
-       high above the floor as before.
+    1. Extend: the evaluation becomes the run's reference, the cycle is in its last `fraction` but has not ended, and it
+       was extended fewer than `max_extensions` times. The rest of the cycle then takes 1 + `extend` times as long, at
+       most up to the end of the run (`RestartsConfig.last_cycle` may let it take all of that). The learning rate
+       continues without a jump. The first reference of the run, and a cycle whose rest would not grow, extend nothing.
+    2. Restart: none of the last `patience` evaluations became the cycle's reference, the cycle has not ended, and the
+       run has at least as many steps left as the cycle has had (so that no run ends at the high rates of a new cycle).
+       The next update begins a cycle with this one's period. From then on the peak is only `shrink` times as high
+       above the floor as before.
 
     Attributes:
         metric: a score of the evaluation, "group/name". The scores of lane graphs have no loss: choose another one, and

@@ -112,11 +112,6 @@ def batch_notices(config: RunConfig, changed: RunConfig) -> list[str]:
     ]
 
 
-def override_names(config: RunConfig) -> list[str]:
-    """Return the dotted names of all settings that arguments can change."""
-    return [name for name, value in settings(config) if not dataclasses.is_dataclass(value)]
-
-
 def _choose_parts(config: RunConfig, arguments: Sequence[str]) -> tuple[RunConfig, list[str]]:
     """Return the configuration with the chosen parts, and the remaining arguments."""
     left = list(arguments)

@@ -120,7 +120,7 @@ def test_options_are_not_abbreviated(capsys):
             "compare tf_lane/toponet --training.seeds 7 8",
             "--training.seeds is of `tflane train`: give compare its seeds",
         ),
-        ("export RUN --out model.json", "--out model.json: the table of latencies has this name"),
+        ("export RUN --out model.json", "--out model.json: a file beside the program has this name"),
         ("score tusimple pr\udce9d.json truth.json", "cannot read 'pr\\udce9d.json': the name is not UTF-8"),
         (
             "summary --no-compile --config tf_lane/toponet_tfm:street --data.example.history 10",

@@ -11,19 +11,19 @@ from tests.models.images import HEIGHT, WIDTH, road_image, tiny_task
 from tests.parameters import random_params
 from tests.slow import with_slow
 from tflane_jax.errors import UserError
-from tflane_jax.export import image_program, latencies, load_program, serialized_model
+from tflane_jax.export import image_program, largest_difference, latencies, load_program, serialized_model
 
 
 @pytest.fixture(scope="module")
-def model():
+def program():
     task = tiny_task()
-    return task, random_params(task.init, road_image(0))
+    return image_program(task, random_params(task.init, road_image(0)), height=HEIGHT, width=WIDTH)
 
 
 @pytest.fixture(scope="module")
-def exported(model, tmp_path_factory):
+def exported(program, tmp_path_factory):
     path = tmp_path_factory.mktemp("export") / "m.stablehlo"
-    path.write_bytes(serialized_model(*model, height=HEIGHT, width=WIDTH))
+    path.write_bytes(serialized_model(program))
     return path
 
 
@@ -32,15 +32,15 @@ def images(count):
 
 
 @pytest.mark.parametrize("batch", with_slow([1, 3], quick=[3]))
-def test_exported_program_equals_the_model_for_any_batch_size(model, exported, batch):
-    expected = jax.jit(image_program(*model))(images(batch))
+def test_exported_program_equals_the_model_for_any_batch_size(program, exported, batch):
+    expected = jax.jit(program.call)(images(batch))
     answer = load_program(exported).call(images(batch))
     for name in ("logits", "curves"):
         np.testing.assert_allclose(answer[name], expected[name], rtol=1e-5, atol=1e-6)
 
 
 @pytest.mark.slow
-def test_exported_program_runs_without_this_package(model, exported, tmp_path):
+def test_exported_program_runs_without_this_package(program, exported, tmp_path):
     np.save(tmp_path / "images.npy", images(2))
     code = (
         "import sys, numpy as np; from jax import export\n"
@@ -50,7 +50,7 @@ def test_exported_program_runs_without_this_package(model, exported, tmp_path):
         "assert not any(name.startswith(('tflane_jax', 'flax')) for name in sys.modules)\n"
     )
     subprocess.run([sys.executable, "-c", code], cwd=tmp_path, check=True)
-    expected = jax.jit(image_program(*model))(images(2))
+    expected = jax.jit(program.call)(images(2))
     with np.load(tmp_path / "answer.npz") as answer:
         for name in ("logits", "curves"):
             np.testing.assert_allclose(answer[name], expected[name], rtol=1e-5, atol=1e-6)
@@ -60,10 +60,18 @@ def test_export_targets_accelerators_too(exported):
     assert load_program(exported).platforms == ("cpu", "cuda")
 
 
-def test_latencies_name_every_batch_size(exported):
-    rows = latencies(load_program(exported), height=HEIGHT, width=WIDTH, batches=(1, 2), runs=3)
+def test_latencies_name_every_batch_size(program, exported):
+    rows = latencies(load_program(exported), program.inputs, batches=(1, 2), runs=3)
     assert [row["batch"] for row in rows] == [1, 2]
     assert all(row["ms"] > 0 for row in rows)
+
+
+def test_differences_are_relative_above_one_and_leave_categories_out():
+    answer = {"points": np.array([0.5, -200.0]), "category": np.array([1, 2])}
+    other = {"points": np.array([0.25, -210.0]), "category": np.array([1, 0])}
+    assert largest_difference(answer, other) == 0.25
+    assert largest_difference(answer, answer) == largest_difference({"points": np.zeros((0, 3))}, {"points": 0}) == 0.0
+    assert np.isnan(largest_difference(answer, other | {"points": np.array([0.5, np.nan])}))
 
 
 def test_bad_files_are_named(exported, tmp_path):

@@ -1,55 +1,103 @@
-"""`tflane export`: writes a monocular model as one StableHLO file, checks its outputs, and measures latency."""
+"""`tflane export`: writes a model as one StableHLO file, checks its outputs, and measures latency."""
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
 from jax import export
 
-from tflane_jax.commands.outputs import check_output, check_table
-from tflane_jax.commands.sources import opened
+from tflane_jax.commands.outputs import check_output, check_table, folders_of
+from tflane_jax.commands.sources import opened, source_for
+from tflane_jax.datasets import sources
 from tflane_jax.errors import UserError
-from tflane_jax.export import image_program, latencies, serialized_model
-from tflane_jax.files.atomic import write_bytes
+from tflane_jax.export import (
+    Program,
+    image_program,
+    largest_difference,
+    latencies,
+    scene_program,
+    serialized_model,
+)
+from tflane_jax.files.atomic import replacing, write_bytes
 from tflane_jax.plots.tables import format_table, save_table
+from tflane_jax.runs import Run
+from tflane_jax.scene import stack_examples
+from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.tasks.lane_shape import LaneShapeTask
 from tflane_jax.training.runtime import configure_jax
 
 HEIGHT, WIDTH = 360, 640
 _TOLERANCE = 1e-5  # rounding depends on the batch size
+_SUFFIX = ".stablehlo"
 
 
 def run(options: argparse.Namespace) -> int:
-    """Write the program, and the table of latencies beside it."""
+    """Write the program; beside it the table of latencies and, of a model of lanes around the vehicle, an example."""
     out: Path = options.out
-    if out.suffix in (".md", ".json"):
-        raise UserError(f"--out {out}: the table of latencies has this name; choose one such as .stablehlo")
-    stem = out.with_suffix("") if out.suffix == ".stablehlo" else out
+    if out.suffix in (".md", ".json", ".npz"):
+        raise UserError(f"--out {out}: a file beside the program has this name; choose one such as {_SUFFIX}")
+    stem = out.with_suffix("") if out.suffix == _SUFFIX else out
     check_output(out)
     check_table(stem)
     configure_jax()
     run, rest = opened(options)
     if rest:
         raise UserError(f"tflane export takes one run, {rest[0]} is too many")
-    task = run.config.task
-    if not isinstance(task, LaneShapeTask):
-        raise UserError(f"{run.name} predicts lane graphs: tflane export takes models of lane lines in one image")
     if (weights := Path(run.name)).is_file():
         check_output(out, [weights])
-    content = serialized_model(task, run.params[0], height=HEIGHT, width=WIDTH)
-    program = export.deserialize(content)
-    images = np.random.default_rng(0).integers(0, 256, (2, HEIGHT, WIDTH, 3), np.uint8)
-    ours, exported = jax.jit(image_program(task, run.params[0]))(images), program.call(images)
-    difference = max(float(abs(ours[name] - exported[name]).max()) for name in ours)
-    if not difference <= _TOLERANCE:
+    example = stem.with_name(stem.name + ".npz")
+    program = _program(run, options, [out, example])
+    content = serialized_model(program)
+    loaded = export.deserialize(content)
+    inputs = stack_examples([program.inputs] * 2)
+    ours, exported = jax.jit(program.call)(inputs), loaded.call(inputs)
+    if not (difference := largest_difference(ours, exported)) <= _TOLERANCE:
         raise UserError(f"the program gives other numbers than the model (by {difference:.2g}): it is not written")
-    rows = latencies(program, height=HEIGHT, width=WIDTH)
+    arrays = _arrays(program.inputs, exported)
+    print(format_table(arrays, title=f"{out.name}: arrays of a batch of b"))
+    batches = (1, 4, 16) if isinstance(run.config.task, LaneShapeTask) else (1, 4)
+    rows = latencies(loaded, program.inputs, batches=batches)
     title = f"{out.name}: latency on {jax.devices()[0].device_kind}"
-    print(format_table(rows, title=title, digits=2))
+    print("\n" + format_table(rows, title=title, digits=2))
     write_bytes(out, content)
-    written = save_table(stem, rows, {"model": run.name, "step": run.step}, title=title, digits=2)
+    written = save_table(stem, rows, {"model": run.name, "step": run.step, "arrays": arrays}, title=title, digits=2)
     print(f"\n{out}: {len(content) / 1e6:.1f} MB, the model's numbers within {difference:.1g}; table in {written[0]}")
+    if isinstance(program.inputs, dict):
+        answers = {f"answer/{name}": np.asarray(array)[0] for name, array in exported.items()}
+        with replacing(example) as temporary, open(temporary, "wb") as file:
+            np.savez_compressed(file, **program.inputs, **answers)
+        print(f"one frame and its answer in {example}")
     return 0
+
+
+def _program(run: Run, options: argparse.Namespace, written: Sequence[Path]) -> Program:
+    """Return the model as a function; raise UserError where it cannot be one, or data would be written over."""
+    task = run.config.task
+    if isinstance(task, LaneShapeTask):
+        if given := [name for name in ("split", "data", "root") if getattr(options, name) is not None]:
+            raise UserError(f"--{given[0]}: a model of lane lines in one image needs no data to be exported")
+        return image_program(task, run.params[0], height=HEIGHT, width=WIDTH)
+    if not isinstance(task, LaneGraphTask):
+        raise UserError(f"{run.name} is of {type(task).__name__}, which tflane export does not know")
+    source = source_for(run, options)
+    for path in written:
+        check_output(path, folders_of(source))
+    if run.config.evaluation.topology != "learned":
+        print("`successor` holds the learned scores; the run's evaluation.topology adds to them from `points`")
+    return scene_program(task, run.params[0], sources.sample(source))
+
+
+def _arrays(inputs: Any, answers: dict[str, Any]) -> list[dict[str, Any]]:
+    """Return a row for each array of a program, with its shape for a batch of b."""
+    named = inputs if isinstance(inputs, dict) else {"images": inputs}
+    rows = [("input", name, ("b", *leaf.shape), leaf.dtype) for name, leaf in named.items()]
+    rows += [("answer", name, ("b", *leaf.shape[1:]), leaf.dtype) for name, leaf in answers.items()]
+    return [
+        {"": kind, "array": name, "shape": f"({', '.join(map(str, shape))})", "type": str(dtype)}
+        for kind, name, shape, dtype in rows
+    ]

@@ -35,7 +35,6 @@ from typing import Any, cast
 import jax
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.special import expit
 
 from tflane_jax.commands.sources import limited_task, make_folder, model_title, source_for
 from tflane_jax.commands.views import with_images
@@ -52,8 +51,9 @@ from tflane_jax.plots import save_camera_views, save_examples
 from tflane_jax.plots.segments import true_lanes
 from tflane_jax.plots.tables import counted
 from tflane_jax.runs import Run
-from tflane_jax.scene import Example, LinePrediction, Prediction, SegmentPrediction
+from tflane_jax.scene import Example, LinePrediction, Prediction
 from tflane_jax.tasks import spread
+from tflane_jax.tasks.answers import answer_arrays
 from tflane_jax.tasks.lane_pictures import Found, lanes_of, titles
 
 _RELATION_THRESHOLD = 0.5
@@ -104,28 +104,10 @@ def predict(trained: Run, options: argparse.Namespace) -> int:
 
 def _arrays(answer: Prediction, infos: Sequence[FrameInfo], topology: Topology = "learned") -> dict[str, np.ndarray]:
     """Return the arrays of predictions.npz; edges between lanes are those that `tflane eval` measures."""
-    lanes, elements = lanes_of(answer), answer.elements
-    scores = expit(lanes.logits).max(-1)
-    arrays = {"points": np.asarray(lanes.points), "scores": scores}
-    if isinstance(lanes, LinePrediction):
-        arrays["category"] = np.asarray(lanes.logits).argmax(-1)
-    else:
-        logits = lanes.successor_logits
-        arrays["successor"] = np.stack(
-            [
-                edge_confidences(points, None if logits is None else np.asarray(logits)[i], topology)
-                for i, points in enumerate(np.asarray(lanes.points))
-            ]
-        )
-    if isinstance(lanes, SegmentPrediction):
-        arrays |= {"left": np.asarray(lanes.left), "right": np.asarray(lanes.right)}
-        arrays["category"] = np.asarray(lanes.logits).argmax(-1)
-        types = {"left_type": lanes.left_type_logits, "right_type": lanes.right_type_logits}
-        arrays |= {name: np.asarray(logits).argmax(-1) for name, logits in types.items() if logits is not None}
-    if elements is not None:
-        arrays["box"] = np.asarray(elements.box)
-        arrays["attribute_score"] = expit(elements.logits)
-        arrays["element_lane"] = expit(elements.lane_logits)
+    arrays, lanes = answer_arrays(answer), lanes_of(answer)
+    if topology == "geometric" and not isinstance(lanes, LinePrediction) and lanes.successor_logits is not None:
+        pairs = zip(lanes.points, lanes.successor_logits, strict=True)
+        arrays["successor"] = np.stack([edge_confidences(*each, topology) for each in pairs])
     arrays["scene"] = np.array([info.scene for info in infos])
     arrays["timestamp_ns"] = np.array([info.timestamp_ns for info in infos], np.int64)
     return arrays

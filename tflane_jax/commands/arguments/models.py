@@ -178,11 +178,12 @@ def export(commands) -> None:
     parser = command(
         commands,
         "export",
-        "write a model of lane lines in one image as a StableHLO program",
+        "write a model with its weights as one StableHLO program",
         module="export",
         function="run",
     )
     model_arguments(parser)
+    split_arguments(parser, "val", "; a model of lanes around the vehicle is checked with its first frame")
     parser.add_argument(
         "--out", metavar="FILE", type=Path, default=Path("model.stablehlo"), help="default model.stablehlo"
     )

@@ -122,6 +122,16 @@ def test_evaluation_with_geometric_topology_has_a_file_of_its_own(trained):
         assert json.loads(path.read_text())["meta"]["topology"] == topology
 
 
+def test_evaluation_by_another_version_has_a_file_of_its_own(trained, capsys):
+    """Regression: the table left scores of the second version out."""
+    assert main(["eval", str(trained), "--checkpoint", "last", "--versions", "v2.1", "v1.0"]) == 0
+    content = json.loads((trained / "evaluations/procedural-test-step4-v2.1_v1.0.json").read_text())
+    assert "v1.0" in content["meta"]["protocol"]
+    assert {"TOP_ll", "TOP_ll_v1.0"} <= content["rows"][0].keys()
+    assert main(["eval", str(trained), "--map-measures", "iou"]) == 2
+    assert "--map-measures are those of the lines of a vector map, and this model" in capsys.readouterr().err
+
+
 def test_prediction_writes_arrays_json_and_pictures(trained, tmp_path):
     out = tmp_path / "predictions"
     assert main(["predict", str(trained), "--count", "2", "--out", str(out), "--threshold", "0"]) == 0

@@ -321,7 +321,8 @@ def evaluate_run(
             table = {name: np.array(numbers) for name, numbers in by_name(values).items()}
             rows.append({"lanes of": group, "seed": "mean"} | {k: float(v.mean()) for k, v in table.items()})
             rows.append({"lanes of": group, "seed": "std"} | {k: float(v.std(ddof=1)) for k, v in table.items()})
-    columns = task.columns
+    further_versions = run.config.evaluation.versions[1:]
+    columns = [name for base in task.columns for name in (base, *(f"{base}_{each}" for each in further_versions))]
     return every[0].protocol, [{name: row[name] for name in columns if name in row} for row in rows]
 
 

@@ -8,15 +8,9 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from tflane_jax.commands.chosen_evaluation import evaluation_suffix, with_chosen_evaluation
 from tflane_jax.commands.outputs import check_table
-from tflane_jax.commands.sources import (
-    data_name,
-    limited_task,
-    opened,
-    source_for,
-    with_chosen_topology,
-    with_chosen_traffic,
-)
+from tflane_jax.commands.sources import data_name, limited_task, opened, source_for
 from tflane_jax.config_io import to_json
 from tflane_jax.datasets import sources
 from tflane_jax.datasets.front_views import FrontViewConfig, FrontViewDataset
@@ -47,7 +41,9 @@ def run(options: argparse.Namespace) -> int:
     trained, rest = opened(options)
     if rest:
         raise UserError(f"tflane eval takes one run: leave {rest[0]} out")
-    trained = with_chosen_topology(with_chosen_traffic(trained, options), options)
+    own = trained.config.evaluation
+    trained = with_chosen_evaluation(trained, options)
+    evaluation = trained.config.evaluation
     if options.errors and not _predicts_lanes(trained.config.task):
         raise UserError("--errors needs a model that predicts centerlines or lane segments")
     source = source_for(trained, options)
@@ -57,10 +53,7 @@ def run(options: argparse.Namespace) -> int:
     name = f"{data_name(source, options)}-step{trained.step}"
     if options.max_instances is not None:
         name += f"-max_instances{options.max_instances}"
-    if (traffic := trained.config.evaluation.traffic) != "own":
-        name += f"-traffic_{traffic.replace('-', '_')}"
-    if (topology := trained.config.evaluation.topology) != "learned":
-        name += f"-topology_{topology}"
+    name += evaluation_suffix(evaluation, own)
     # Published weights have no run folder: theirs are distinguished by name.
     of_weights = Path("runs") / "evaluations" / f"{Path(trained.name).stem}-{name}"
     stem = options.out or (of_weights if options.config else Path(trained.name) / "evaluations" / name)
@@ -75,8 +68,8 @@ def run(options: argparse.Namespace) -> int:
         "step": trained.step,
         "protocol": protocol,
         "max_instances": options.max_instances,
-        "traffic": traffic,
-        "topology": topology,
+        "traffic": evaluation.traffic,
+        "topology": evaluation.topology,
         "source": to_json(source),
         "near_training": None if near is None else near.sentence(),
     }

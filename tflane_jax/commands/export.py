@@ -13,6 +13,7 @@ from jax import export
 
 from tflane_jax.commands.outputs import check_output, check_table, folders_of
 from tflane_jax.commands.sources import opened, source_for
+from tflane_jax.config_io import settings
 from tflane_jax.datasets import sources
 from tflane_jax.errors import UserError
 from tflane_jax.export import (
@@ -32,7 +33,8 @@ from tflane_jax.tasks.lane_shape import LaneShapeTask
 from tflane_jax.training.runtime import configure_jax
 
 HEIGHT, WIDTH = 360, 640
-_TOLERANCE = 1e-5  # rounding depends on the batch size
+_TOLERANCE, _OF_HALVES = 1e-3, 0.1
+"""Two compiled programs of one model differ by rounding, which its layers amplify; 1.5e-5 was seen in float32."""
 _SUFFIX = ".stablehlo"
 
 
@@ -56,7 +58,8 @@ def run(options: argparse.Namespace) -> int:
     loaded = export.deserialize(content)
     inputs = stack_examples([program.inputs] * 2)
     ours, exported = jax.jit(program.call)(inputs), loaded.call(inputs)
-    if not (difference := largest_difference(ours, exported)) <= _TOLERANCE:
+    halves = any(value == "bfloat16" for _, value in settings(run.config.task))
+    if not (difference := largest_difference(ours, exported)) <= (_OF_HALVES if halves else _TOLERANCE):
         raise UserError(f"the program gives other numbers than the model (by {difference:.2g}): it is not written")
     arrays = _arrays(program.inputs, exported)
     print(format_table(arrays, title=f"{out.name}: arrays of a batch of b"))

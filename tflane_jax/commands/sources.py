@@ -84,28 +84,6 @@ def limited_task(run: Run, options: argparse.Namespace) -> Any:
     return limit_instances(run.config.task, options.max_instances)
 
 
-def with_chosen_traffic(run: Run, options: argparse.Namespace) -> Run:
-    """Return the run evaluated with the traffic flow of --traffic; raise UserError for a model that takes none."""
-    if options.traffic is None:
-        return run
-    task = run.config.task
-    if not isinstance(task, LaneGraphTask) or task.model.priors.traffic_flow is None:
-        raise UserError("--traffic changes the traffic flow that a model sees, and this model takes none")
-    evaluation = replace(run.config.evaluation, traffic=options.traffic)
-    return replace(run, config=replace(run.config, evaluation=evaluation))
-
-
-def with_chosen_topology(run: Run, options: argparse.Namespace) -> Run:
-    """Return the run evaluated with the edges of --topology; raise UserError for a model that predicts none."""
-    if options.topology is None:
-        return run
-    task = run.config.task
-    if not isinstance(task, LaneGraphTask) or not {"centerlines", "segments"} & {*task.model.predicts}:
-        raise UserError("--topology is about which lane follows which, and this model does not predict it")
-    evaluation = replace(run.config.evaluation, topology=options.topology)
-    return replace(run, config=replace(run.config, evaluation=evaluation))
-
-
 def chosen_source(config: RunConfig, options: argparse.Namespace, split: Split | None = None) -> Any:
     """Return the data selected by --split, --data, --root, --openlane and --data-dict.
 

@@ -70,6 +70,19 @@ def evaluate(commands) -> None:
         "(default: the configuration's)",
     )
     parser.add_argument(
+        "--versions",
+        nargs="+",
+        choices=("v2.1", "v1.0"),
+        help="versions of OpenLane-V2's metrics of centerlines; the second one adds columns (default: the "
+        "configuration's)",
+    )
+    parser.add_argument(
+        "--map-measures",
+        nargs="+",
+        choices=("chamfer", "iou"),
+        help="of the lines of a vector map: MapTR's AP by distance, and by overlap (default: the configuration's)",
+    )
+    parser.add_argument(
         "--errors",
         action="store_true",
         help="also count lanes found with a wrong extent, in part, or not at all, and the same of detections",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import jax
 import numpy as np
@@ -57,7 +57,7 @@ def run(options: argparse.Namespace) -> int:
     content = serialized_model(program)
     loaded = export.deserialize(content)
     inputs = stack_examples([program.inputs] * 2)
-    ours, exported = jax.jit(program.call)(inputs), loaded.call(inputs)
+    ours, exported = jax.jit(program.call)(inputs), cast(dict[str, Any], loaded.call(inputs))
     halves = any(value == "bfloat16" for _, value in settings(run.config.task))
     if not (difference := largest_difference(ours, exported)) <= (_OF_HALVES if halves else _TOLERANCE):
         raise UserError(f"the program gives other numbers than the model (by {difference:.2g}): it is not written")

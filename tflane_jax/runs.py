@@ -24,6 +24,7 @@ from tflane_jax.datasets.data_source import loading_of
 from tflane_jax.datasets.sources import check_labelled, source_of
 from tflane_jax.devices import training_mesh
 from tflane_jax.errors import UserError, install
+from tflane_jax.evaluation.results import in_all_versions
 from tflane_jax.files.atomic import write_json, write_text
 from tflane_jax.limits import check_settings
 from tflane_jax.migrations import migrate
@@ -321,8 +322,7 @@ def evaluate_run(
             table = {name: np.array(numbers) for name, numbers in by_name(values).items()}
             rows.append({"lanes of": group, "seed": "mean"} | {k: float(v.mean()) for k, v in table.items()})
             rows.append({"lanes of": group, "seed": "std"} | {k: float(v.std(ddof=1)) for k, v in table.items()})
-    further_versions = run.config.evaluation.versions[1:]
-    columns = [name for base in task.columns for name in (base, *(f"{base}_{each}" for each in further_versions))]
+    columns = in_all_versions(task.columns)
     return every[0].protocol, [{name: row[name] for name in columns if name in row} for row in rows]
 
 

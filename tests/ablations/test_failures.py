@@ -172,6 +172,18 @@ def test_the_scores_name_their_seeds(tmp_path, capsys):
     }
 
 
+def test_the_table_shows_every_version_and_the_tests_are_of_the_first(tmp_path, capsys):
+    """Regression: the table left scores of the second version out."""
+    results = Results(("base", "tfm"), (0, 1), {})
+    for model in results.models:
+        for seed in results.seeds:
+            scores = {"all/TOP_ll": 0.1 * seed, "all/TOP_ll_v1.0": 0.2 + 0.1 * seed}
+            results.add("", "last", model, seed, Measured(4, "a protocol", {"": scores}, {"": {}}))
+    save_report(results, RunConfig().task, {}, tmp_path)
+    assert [name for name in rows(tmp_path / "table.md")[0] if "TOP" in name] == ["all/TOP_ll", "all/TOP_ll_v1.0"]
+    assert {row["metric"] for row in rows(tmp_path / "paired.md")} == {"all/TOP_ll"}
+
+
 def test_a_row_that_lacks_seeds_takes_none_from_another_row(tmp_path, capsys):
     """Regression: paired tests took the seeds that all rows have, so one failed row left the others without any."""
     results = Results(("base", "tfm", "poor", "none"), (0, 1, 2), {})

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Annotated, Literal
+from typing import Annotated, Literal, get_args
 
 from tflane_jax.evaluation.geometric_topology import Topology
 from tflane_jax.limits import DIFFERENT, NOT_EMPTY, Count, CountOrZero
@@ -39,6 +39,11 @@ class EvaluationConfig:
     traffic: Traffic = "own"
     topology: Topology = "learned"
     map_measures: Annotated[tuple[Measure, ...], DIFFERENT] = ("chamfer",)
+
+
+def in_all_versions(scores: Iterable[str]) -> list[str]:
+    """Return names of scores, each followed by its names in every version of the metrics (`versions`, the second)."""
+    return [name for score in scores for name in (score, *(f"{score}_{version}" for version in get_args(Version)))]
 
 
 @dataclass(frozen=True)

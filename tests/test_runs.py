@@ -28,7 +28,9 @@ from tflane_jax.runs import (
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.tasks.lane_shape import LaneShapeTask
 from tflane_jax.training.adaptive import AdaptiveConfig
+from tflane_jax.training.checkpoint import Checkpoints
 from tflane_jax.training.restarts import RestartsConfig
+from tflane_jax.training.resumption import carried, latest
 
 
 @pytest.fixture(scope="module")
@@ -48,6 +50,16 @@ def test_parameters_of_another_model_are_not_saved(config, tmp_path, monkeypatch
     save_weights(config, {"scale": jnp.ones(3)}, str(tmp_path / "run"))
     with pytest.raises(UserError, match=r"run already holds a run: choose another folder, or delete that one$"):
         save_weights(config, {"scale": jnp.ones(3)}, tmp_path / "run")
+
+
+def test_weights_that_no_training_wrote_are_not_resumed(config, tmp_path):
+    """Regression: their checkpoint was called damaged, with the advice to delete it."""
+    write_weights(config, {"scale": jnp.ones(3)}, tmp_path / "own")
+    checkpoints = Checkpoints(tmp_path / "own" / "checkpoints")
+    saved = latest(checkpoints)
+    assert saved is not None
+    with pytest.raises(UserError, match=r"none to resume: start one from them, --training.init-from \S*own, in"):
+        carried(checkpoints, saved, [])
 
 
 def test_a_start_from_another_model_is_told_before_data_are_read(config, tmp_path, monkeypatch):

@@ -156,8 +156,8 @@ def check_origin(config: RunConfig, *, replaced: Path | None = None) -> None:
             f"{', '.join(config.task.frozen)} would stay random: this configuration freezes them "
             "(task.model.encoder.images.frozen_stages) and starts from no weights. Convert ImageNet's from a "
             "torchvision file (tflane convert --config FILE --weights resnet50.pth --out runs/imagenet) and set "
-            "training.init_from=runs/imagenet and training.init_partly; or train them, with frozen_stages 0 and "
-            "backbone.frozen_norms false"
+            "training.init_from=runs/imagenet and training.init_partly; or train them, with "
+            "--task.model.encoder.images.frozen-stages 0 and --task.model.encoder.images.backbone.no-frozen-norms"
         )
 
 

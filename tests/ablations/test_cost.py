@@ -1,6 +1,7 @@
 """What tables cost by their own figures, beside what was recorded, and beside the runs that a store would hold."""
 
 import json
+import re
 from dataclasses import replace
 
 import pytest
@@ -53,6 +54,14 @@ def test_the_cost_of_all_tables_is_that_of_the_runs_that_a_store_would_hold():
             for key, minutes in runs.items():
                 costs[key, seed] = max(costs.get((key, seed), 0.0), minutes)
     assert core_minutes(TABLES.values()) == pytest.approx(sum(costs.values()))
+
+
+def test_the_page_says_what_the_tables_cost():
+    of_papers = [t for name, t in TABLES.items() if re.fullmatch(r"tf_lane\.\d|gtn_lane\.1|markers\.[1-4]", name)]
+    assert len(of_papers) == 12
+    papers, every = (f"{core_minutes(tables) / 60:.0f}" for tables in (of_papers, TABLES.values()))
+    page = " ".join((ROOT / "docs" / "comparisons.md").read_text().split())
+    assert f"twelve tables of the papers take {papers} hours of one core, all tables {every}, by times" in page
 
 
 def test_estimates_are_what_was_recorded():

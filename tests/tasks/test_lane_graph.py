@@ -250,6 +250,12 @@ def test_interventions_are_those_that_change_something():
     for blind in (LaneGraphTask(BASELINE), limit_instances(task, 0)):
         assert blind.interventions(data, config) == {}
     assert task.interventions(data, replace(config, traffic="none")) == {}
+    # Regression: with geometric topology there was none, without a word.
+    geometric = task.interventions(data, replace(config, topology="geometric"))
+    assert [(each.traffic, each.topology) for each in geometric.values()] == [
+        ("none", "geometric"),
+        ("other-scene", "geometric"),
+    ]
 
 
 def test_an_evaluation_keeps_recall_as_counts_by_scene(monkeypatch):

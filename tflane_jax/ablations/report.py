@@ -10,7 +10,6 @@ from tflane_jax.ablations.comparison import compact, shared_seeds, summarise
 from tflane_jax.ablations.jobs import file_names
 from tflane_jax.ablations.results import Results
 from tflane_jax.ablations.scores import CHECKPOINTS, OWN_TEST
-from tflane_jax.evaluation.results import in_all_versions
 from tflane_jax.files.atomic import write_json
 from tflane_jax.plots.tables import format_table, save_table
 from tflane_jax.tasks import Task
@@ -32,7 +31,7 @@ def save_report(results: Results, task: Task, remarks: Mapping[str, Mapping[str,
             for scores in by_seed.values()
         ]
         metrics = [name for name in task.compared if all(name in scores for scores in every)]
-        shown = [name for name in in_all_versions(task.compared) if all(name in scores for scores in every)]
+        shown = [name for name in task.shown or task.compared if all(name in scores for scores in every)]
         written.append(_save_table(results, test, shown, task, remarks, out / f"table{suffix}"))
         if len(results.seeds) > 1:
             written += _save_paired(results, test, metrics, task, out / f"paired{suffix}")

@@ -91,7 +91,7 @@ def sweep(
     every = [each for by_value in scores.values() for found in by_value for each in found]
     known = [name for name in every[0] if all(name in each for each in every)]
     _check_metrics(metrics or (), known)
-    metrics = metrics or [name for name in task.compared if name in known]
+    metrics = metrics or [name for name in task.shown or task.compared if name in known]
     rows = []
     for i, value in enumerate(values):
         found = compact({name: by_value[i] for name, by_value in scores.items()}, metrics)

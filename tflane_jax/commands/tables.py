@@ -176,6 +176,7 @@ def _listed(name: str) -> dict[str, str | int | float]:
         "table": name,
         "shows": table.title,
         "rows": len(table.rows),
+        "claims": len(table.claims),
         "seeds": table.seeds,
         "decided by": table.primary,
         "one core": f"{core_minutes([table]) / 60:.0f} h",

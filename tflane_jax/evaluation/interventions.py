@@ -57,7 +57,7 @@ def traffic_interventions(arrays: Example | Streamed, config: EvaluationConfig) 
 
     Empty for an evaluation that is an intervention itself.
     """
-    if config.traffic != "own" or config.topology != "learned":
+    if config.traffic != "own":
         return {}
     found = {NO_TRAFFIC: replace(config, traffic="none")}
     if len(np.unique(scene_numbers(arrays))) > 1:

@@ -61,6 +61,8 @@ class Task(Generic[ExampleT, DataT, SourceT, MemoryT]):
     """Columns of the evaluation's table; those that an evaluation lacks are left out."""
     compared: ClassVar[tuple[str, ...]] = ()
     """Scores ("group/name") that a comparison tests; those that some model lacks are left out."""
+    shown: ClassVar[Sequence[str]] = ()
+    """Scores in the tables of a comparison, in this order; () for `compared`."""
     errors: ClassVar[tuple[str, ...]] = ERRORS
     """Scores where lower is better, without their group ("loss", not "all/loss")."""
     open_base: ClassVar[bool] = True

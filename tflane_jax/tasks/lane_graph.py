@@ -79,6 +79,7 @@ class LaneGraphTask(Task[Example, Example | Streamed, LaneGraphSource, HostMemor
 
     columns: ClassVar[tuple[str, ...]] = score_names.COLUMNS
     compared: ClassVar[tuple[str, ...]] = score_names.COMPARED
+    shown: ClassVar[Sequence[str]] = score_names.SHOWN
     notices: ClassVar[Mapping[str, str]] = {
         f"{LOST}/camera_cells": "BEV cells that a camera sees do without it, because it sees more than `capacity` of "
         "BevFormerConfig: raise that, or leave it None"

@@ -6,7 +6,7 @@ from tflane_jax.datasets.base import ExampleConfig
 from tflane_jax.evaluation.lane_graph import LaneGraphMetrics, Sightings
 from tflane_jax.evaluation.lane_groups import LANE_GROUPS
 from tflane_jax.evaluation.map_metrics import LineLabel
-from tflane_jax.evaluation.results import Evaluation, EvaluationConfig
+from tflane_jax.evaluation.results import Evaluation, EvaluationConfig, in_all_versions
 from tflane_jax.files.openlane import ATTRIBUTES
 from tflane_jax.metrics.map_matching import LINE_CLASSES
 from tflane_jax.models.host import HostConfig
@@ -62,6 +62,9 @@ COMPARED = (
     *(f"lines {group}/recall" for group in ("occluded", "clear", *LANE_GROUPS[:2], LANE_GROUPS[-1])),
 )
 """Scores that a comparison tests."""
+
+SHOWN = in_all_versions((*COMPARED, "all/DET_a", "all/OLUS", "all/TOP_lste", "lines IoU/mAP"))
+"""Scores in the table of a comparison: also those of the metrics' second version, and of slow or rare metrics."""
 
 
 def score_names(model: HostConfig, example: ExampleConfig, config: EvaluationConfig, *, grouped: bool) -> set[str]:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, TypedDict
 
+from tflane_jax.errors import UserError
 from tflane_jax.training.adaptive import Memory
 from tflane_jax.training.checkpoint import Checkpoints
 from tflane_jax.training.records import Window
@@ -48,7 +49,7 @@ def latest(checkpoints: Checkpoints) -> Latest | None:
 
 
 def carried(checkpoints: Checkpoints, saved: Latest, fresh: Sequence[Memory]) -> Carried:
-    """Return what to go on with; raises UserError if it is not what was written.
+    """Return what to go on with; raises UserError if it is not what was written, or was written without a training.
 
     Args:
         checkpoints: of the run, to name the damaged one.
@@ -56,6 +57,12 @@ def carried(checkpoints: Checkpoints, saved: Latest, fresh: Sequence[Memory]) ->
         fresh: memories for a run that had no adaptive schedule so far.
     """
     progress = saved["progress"]
+    if "window" not in progress and saved["step"] == 0:
+        folder = checkpoints.path(0).parent.parent
+        raise UserError(
+            f"{folder} holds weights that no training wrote, so that there is none to resume: start one from them, "
+            f"--training.init-from {folder}, in another folder"
+        )
     try:
         sums = {name: list(map(float, values)) for name, values in progress["window"]["sums"].items()}
         return Carried(

@@ -67,6 +67,14 @@ def test_a_part_of_openlane_v2_is_chosen_by_its_split_file(tmp_path):
         chosen_source(RunConfig(), options)
 
 
+def test_a_world_of_other_heights_is_refused(trained, capsys):
+    """Regression: only a raster of another box was, so not heights, and no box for cameras."""
+    assert main(["eval", str(trained), "--data", "hills"]) == 2
+    said = capsys.readouterr().err
+    assert "--data hills does not fit this model: " in said
+    assert "z (-6.0, 6.0)" in said
+
+
 @pytest.mark.parametrize("command", ["eval", "predict"])
 def test_a_world_of_another_box_is_refused(trained, command, tmp_path, capsys):
     """The default model perceives +-50 m x +-25 m: in the smaller raster, it would see all lanes in the wrong place."""

@@ -3,6 +3,7 @@
 import json
 import pickle
 import shutil
+from dataclasses import replace
 
 import pytest
 
@@ -19,6 +20,9 @@ from tflane_jax.datasets.sources import check_labelled
 from tflane_jax.datasets.view_images import TOPONET_SUBSET_A, TOPONET_SUBSET_B
 from tflane_jax.errors import UserError
 from tflane_jax.files.openlane import info_files
+from tflane_jax.models.lanesegnet import LaneSegNetConfig
+from tflane_jax.models.maptr import MapTrConfig
+from tflane_jax.models.toponet import TopoNetConfig
 from tflane_jax.run_checks import check_run
 from tflane_jax.scoring.protocols import find_protocol
 from tflane_jax.scoring.score import score
@@ -105,6 +109,22 @@ def test_images_of_another_size_keep_all_their_rows(whole):
     assert preset_of(whole / "nothing", "train", subset_of(whole)) == preset
     choice = Choice("train", True, WorldData().source("train"), whole)
     assert OpenLaneV2Dataset(SOURCE.choose(choice)).example(0).cameras is not None
+
+
+@pytest.mark.parametrize(
+    ("truth", "lanes", "segments"),
+    [
+        (TopoNetConfig.truth, True, False),
+        (LaneSegNetConfig.truth, False, True),
+        (MapTrConfig.truth, False, True),
+        (("lanes", "segments"), True, True),
+    ],
+)
+def test_a_model_from_other_data_gets_the_truth_that_it_predicts(whole, truth, lanes, segments):
+    """Regression: models of segments and of vector maps were scored against no lane at all."""
+    chosen = SOURCE.choose(Choice("train", True, WorldData().source("train"), whole, truth=truth))
+    example = OpenLaneV2Dataset(replace(chosen, image=None)).example(0)
+    assert (example.lanes.valid.any(), example.segments.valid.any()) == (lanes, segments)
 
 
 def test_links_are_followed(whole, tmp_path):

@@ -61,6 +61,9 @@ def run(options: argparse.Namespace) -> int:
     protocol, rows = evaluate_run(trained, source, task=task, frame_groups=groups)
     title = f"{trained.name}, {name}: {protocol}"
     print(format_table(rows, title=title))
+    counts = [row[kind] for row in rows for kind in ("lanes", "lines") if kind in row]
+    if counts and not any(counts):
+        print(f"tflane: warning: {name} has no true lane: these scores are conventions", file=sys.stderr)
     if near is not None:
         print(f"\n{near.sentence()}")
     meta = {

@@ -26,6 +26,7 @@ from tflane_jax.datasets.sources import (
 )
 from tflane_jax.errors import UserError
 from tflane_jax.files.folders import named_folder
+from tflane_jax.geometry import PerceptionRange
 from tflane_jax.models.host import HostConfig
 from tflane_jax.run_checks import EXAMPLE_NAMES, check_kind
 from tflane_jax.runs import Run, open_run, open_weights
@@ -115,7 +116,8 @@ def chosen_source(config: RunConfig, options: argparse.Namespace, split: Split |
         # The name of a folder may be that of a split.
         root = None if options.root is None else named_folder(options.root)
         openlane = None if options.openlane is None else Path(options.openlane)
-        found = source.choose(Choice(chosen, given is not None, configured, root, openlane, option))
+        truth = getattr(getattr(config.task, "model", None), "truth", ("lanes",))
+        found = source.choose(Choice(chosen, given is not None, configured, root, openlane, option, truth))
     if options.data_dict is None:
         return found
     if source is not openlane_v2.SOURCE:
@@ -181,6 +183,17 @@ def _check_world(run: Run, source: Any, options: argparse.Namespace) -> None:
         raise UserError(f"--data {options.data} does not fit this model: {why}; choose data like its own") from None
     if named.root is not None:
         check_raster(source, sample(source))
+        return
+    box, own = source.example.range, run.config.data.source(options.split or options.default_split).example.range
+    if box != own:
+        raise UserError(
+            f"--data {options.data} does not fit this model: its lanes lie within {_box(box)}, those of the run's own "
+            f"data within {_box(own)}; choose data like its own"
+        )
+
+
+def _box(range_: PerceptionRange) -> str:
+    return f"x {range_.x}, y {range_.y}, z {range_.z}"
 
 
 def _check_traffic(run: Run, source: Any) -> None:

@@ -49,6 +49,7 @@ class Choice:
         root: from --root; None only for sources without a root.
         openlane: from --openlane, folder of the OpenLane-V2 split files.
         option: that names the split, for messages; --splits cannot be left out.
+        truth: fields of `Example` with what the model predicts, see `HostConfig.truth`.
     """
 
     split: Split
@@ -57,6 +58,7 @@ class Choice:
     root: Path | None = None
     openlane: Path | None = None
     option: Literal["--split", "--splits"] = "--split"
+    truth: tuple[str, ...] = ("lanes",)
 
 
 @dataclass(frozen=True)

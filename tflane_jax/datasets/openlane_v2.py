@@ -268,7 +268,9 @@ def _choose(choice: Choice) -> OpenLaneV2Config:
         return replace(choice.configured, root=choice.root)
     subset = subset_of(choice.root)
     image = preset_of(choice.root, choice.split, subset)
-    return OpenLaneV2Config(choice.root, choice.split, subset=subset, image=image, example=choice.configured.example)
+    flavour = "centerline" if choice.truth == ("lanes",) else "both" if "lanes" in choice.truth else "lane_segment"
+    example = choice.configured.example
+    return OpenLaneV2Config(choice.root, choice.split, subset=subset, flavour=flavour, image=image, example=example)
 
 
 def _unlabelled(config: OpenLaneV2Config) -> str:

@@ -39,6 +39,7 @@ def check_settings_fit(model: HostConfig, config: ExampleConfig, *, image_scale:
     _check_inputs(model, config, images=image_scale is not None)
     _check_scale(model, image_scale)
     _check_ranges(model, config)
+    _check_heights(model, config)
     _check_raster(model, config)
     _check_lines(model, config)
     _check_marker_points(model, config)
@@ -146,6 +147,15 @@ def _check_ranges(model: HostConfig, config: ExampleConfig) -> None:
             f"lanes are labelled within x {config.range.x}, y {config.range.y} (data.example.range), and the model's "
             f"{'lanes end' if ends else 'traffic flow ends'} at x {model.range.x}, y {model.range.y} "
             "(task.model.range): make either range fit the other"
+        )
+
+
+def _check_heights(model: HostConfig, config: ExampleConfig) -> None:
+    low, high = config.range.z
+    if low < model.range.z[0] or high > model.range.z[1]:
+        raise UserError(
+            f"lanes are labelled within z {config.range.z} (data.example.range), and the model's lanes end at z "
+            f"{model.range.z} (task.model.range): make either range fit the other"
         )
 
 

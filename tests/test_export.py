@@ -71,7 +71,8 @@ def test_differences_are_relative_above_one_and_leave_categories_out():
     other = {"points": np.array([0.25, -210.0]), "category": np.array([1, 0])}
     assert largest_difference(answer, other) == 0.25
     assert largest_difference(answer, answer) == largest_difference({"points": np.zeros((0, 3))}, {"points": 0}) == 0.0
-    assert np.isnan(largest_difference(answer, other | {"points": np.array([0.5, np.nan])}))
+    for wrong in (np.nan, np.inf):
+        assert np.isnan(largest_difference(answer, other | {"points": np.array([0.5, wrong])}))
 
 
 def test_bad_files_are_named(exported, tmp_path):

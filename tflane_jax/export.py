@@ -143,7 +143,7 @@ def load_program(path: Path) -> export.Exported:
 
 
 def largest_difference(ours: Arrays, others: Arrays) -> float:
-    """Return the largest difference of two answers, relative to numbers above 1; NaN where one is not finite.
+    """Return the largest difference of two answers, relative to numbers above 1; NaN if one has a number not finite.
 
     Categories do not count: rounding may decide between two that are equally likely.
     """
@@ -151,7 +151,9 @@ def largest_difference(ours: Arrays, others: Arrays) -> float:
     for name, array in ours.items():
         mine, other = np.asarray(array), np.asarray(others[name])
         if np.issubdtype(mine.dtype, np.inexact):
-            found.append(float(np.max(np.abs(mine - other) / np.maximum(np.abs(mine), 1.0), initial=0.0)))
+            finite = np.isfinite(mine).all() and np.isfinite(other).all()
+            relative = np.abs(mine - other) / np.maximum(np.abs(mine), 1.0) if finite else np.array(np.nan)
+            found.append(float(np.max(relative, initial=0.0)))
     return float(np.max(found))
 
 
@@ -177,6 +179,6 @@ def latencies(
             began = time.perf_counter()
             jax.block_until_ready(call(stacked))
             seconds.append(time.perf_counter() - began)
-        median = float(np.median(seconds[1:]))
+        median = float(np.median(seconds[1:] or seconds))
         rows.append({"batch": batch, "ms": 1e3 * median, "examples/s": batch / median, "compile s": compiled})
     return rows

@@ -117,6 +117,7 @@ def _train(config: RunConfig, folder: Path, *, start: Start, progress: bool, dra
             arrays = in_workers(arrays, loading_of(config.data))
     with agreed(), stage("reading the validation data"):
         validation: Any = task.load(config.data.source("val"), progress=progress)
+        task.check_evaluation(validation, config.evaluation)
 
     def evaluate(params: Params) -> dict[str, float]:
         return task.evaluate(params, validation, config.evaluation).recorded()

@@ -4,6 +4,7 @@ import json
 import pickle
 import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
@@ -20,12 +21,15 @@ from tflane_jax.datasets.sources import check_labelled
 from tflane_jax.datasets.view_images import TOPONET_SUBSET_A, TOPONET_SUBSET_B
 from tflane_jax.errors import UserError
 from tflane_jax.files.openlane import info_files
+from tflane_jax.geometry import PerceptionRange
+from tflane_jax.limits import SettingError, check_settings
 from tflane_jax.models.lanesegnet import LaneSegNetConfig
 from tflane_jax.models.maptr import MapTrConfig
 from tflane_jax.models.toponet import TopoNetConfig
 from tflane_jax.run_checks import check_run
 from tflane_jax.scoring.protocols import find_protocol
 from tflane_jax.scoring.score import score
+from tflane_jax.world.cameras.ring import CameraRigConfig
 
 cv2 = pytest.importorskip("cv2")
 SPLIT_FILE = {subset: f"data_dict_subset_{subset}.json" for subset in "AB"}
@@ -125,6 +129,22 @@ def test_a_model_from_other_data_gets_the_truth_that_it_predicts(whole, truth, l
     chosen = SOURCE.choose(Choice("train", True, WorldData().source("train"), whole, truth=truth))
     example = OpenLaneV2Dataset(replace(chosen, image=None)).example(0)
     assert (example.lanes.valid.any(), example.segments.valid.any()) == (lanes, segments)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"range": PerceptionRange((-30.0, 30.0), (-15.0, 15.0))}, r"example.range .*labels are not cut to it"),
+        ({"bike_lanes": "exclude"}, "labels do not tell bicycle lanes"),
+        ({"cameras": CameraRigConfig()}, "`image` says how the files' images are read"),
+    ],
+)
+def test_settings_that_labels_do_not_follow_are_refused(changes, message):
+    """Regression: they were ignored, so that a model learned lanes outside of its box."""
+    data = OpenLaneV2Data(Path("x"))
+    check_settings(data, "data.")
+    with pytest.raises(SettingError, match=message):
+        check_settings(replace(data, example=replace(data.example, **changes)), "data.")
 
 
 def test_links_are_followed(whole, tmp_path):

@@ -24,6 +24,7 @@ from tflane_jax.datasets.recorded_logs import RECORDED_EXAMPLE, RecordedConfig, 
 from tflane_jax.datasets.sources import named_source, source_of
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import invert_pose, project, transform_points
+from tflane_jax.limits import SettingError, check_settings
 from tflane_jax.markers.simulation import MarkerConfig
 from tflane_jax.scene import LineType
 from tflane_jax.world.cameras.ring import NUSCENES_RING, CameraRigConfig
@@ -152,6 +153,20 @@ def test_a_map_that_was_edited_meanwhile_is_read_again(tmp_path):
 def test_impossible_configurations_are_refused(maps, change, message):
     with pytest.raises(UserError, match=message):
         RealMapDataset(dataclasses.replace(config(maps), **change))
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        (RealMapData(val_logs=("a",), without=("a", "b")), "other logs than val_logs and test_logs name"),
+        (RealMapData(test_logs=("b",), test_traffic="c"), "'' where test_on is not recordings"),
+    ],
+)
+def test_settings_without_effect_are_refused(data, message):
+    """Regression: the named logs were used all the same, and the control had the simulated traffic."""
+    with pytest.raises(SettingError, match=message):
+        check_settings(data, "data.")
+    check_settings(replace(data, without=(), test_on="recordings"), "data.")
 
 
 def test_the_check_lists_maps_and_faults(maps, tmp_path):

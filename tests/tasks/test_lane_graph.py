@@ -11,6 +11,8 @@ import pytest
 from tests.fakes import fake_prediction
 from tests.models.cases import (
     BASELINE,
+    CAMERA_TOPONET,
+    LIFTED_LINES,
     SEGMENTS,
     WITH_TRAFFIC,
     make_example,
@@ -22,11 +24,13 @@ from tests.priors.test_traffic_flow import make_flow
 from tflane_jax.config import RunConfig, WorldData, load_config
 from tflane_jax.datasets.base import ExampleConfig
 from tflane_jax.datasets.map_lines import MapLinesConfig
+from tflane_jax.datasets.photometric import PhotometricConfig
 from tflane_jax.errors import UserError
 from tflane_jax.evaluation.lane_groups import LANE_GROUPS
 from tflane_jax.evaluation.results import EvaluationConfig
 from tflane_jax.geometry import BevGrid, PerceptionRange
 from tflane_jax.layers.bev_attention import LOST
+from tflane_jax.limits import SettingError
 from tflane_jax.markers.simulation import MarkerConfig
 from tflane_jax.models.area_decoder import AreaDecoderConfig
 from tflane_jax.models.bevformer_detr import BevFormerDetrConfig
@@ -41,6 +45,7 @@ from tflane_jax.models.toponet import TopoNetConfig
 from tflane_jax.models.traffic_flow_module import TrafficFlowConfig
 from tflane_jax.scene import Prediction, shapes_of, stack_examples
 from tflane_jax.tasks import lane_graph
+from tflane_jax.tasks.fit import check_augmentation
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.tasks.traffic import limit_instances, queries_only
 from tflane_jax.world.bev.sensor import BevSensorConfig
@@ -256,6 +261,24 @@ def test_interventions_are_those_that_change_something():
         ("none", "geometric"),
         ("other-scene", "geometric"),
     ]
+
+
+def test_an_evaluation_that_examples_cannot_have_is_told_before_training():
+    """Regression: it ended the run at its first evaluation, and no resumed run could pass that."""
+    task, scene = LaneGraphTask(WITH_TRAFFIC), stack_examples([make_example(0)])
+    task.check_evaluation(scene, EvaluationConfig(traffic="none"))
+    with pytest.raises(UserError, match="at least two scenes"):
+        task.check_evaluation(scene, EvaluationConfig(traffic="other-scene"))
+    with pytest.raises(UserError, match="no traffic flow"):
+        task.check_evaluation(scene.replace(traffic_flow=None), EvaluationConfig(traffic="none"))
+
+
+def test_a_depth_network_refuses_images_of_other_sizes():
+    """It gets the cameras' own intrinsics by one scale of all images."""
+    check_augmentation(LIFTED_LINES, PhotometricConfig())
+    check_augmentation(CAMERA_TOPONET, PhotometricConfig(scale=(0.8, 1.0)))
+    with pytest.raises(SettingError, match=r"data\.augmentation\.scale"):
+        check_augmentation(LIFTED_LINES, PhotometricConfig(scale=(0.8, 1.0)))
 
 
 def test_an_evaluation_keeps_recall_as_counts_by_scene(monkeypatch):

@@ -241,6 +241,14 @@ def followed(config, steps, *, warmup=0, every=None, loss=None):
     return [(number, int(c.start), int(c.length), float(c.magnitude)) for number, c in sorted(seen.items())]
 
 
+def test_an_evaluation_without_the_score_is_no_improvement():
+    """Regression: it ended the run, and lost the updates since the last checkpoint."""
+    config = doubling_cycles(710, warmup_steps=10)
+    cycle = jax.device_get(first_cycle(config, 10, 710))._replace(count=np.int32(60))
+    (memory,) = adapt(config, cycle, [Memory()], [{"all/other": 0.5}], 710)[1]
+    assert (memory.best, memory.cycle_best, memory.stale) == (None, None, 1)
+
+
 def test_doubling_cycles_fill_a_run_unless_one_is_extended():
     config = doubling_cycles(710, warmup_steps=10)
     assert followed(config, 710, warmup=10) == [(0, 10, 100, 1), (1, 110, 200, 1), (2, 310, 400, 1)]

@@ -37,7 +37,7 @@ from tflane_jax.datasets.openlane_frames import (
 )
 from tflane_jax.datasets.openlane_markers import SegmentBoards, SegmentFrame, segment_frame
 from tflane_jax.datasets.openlane_sd_map import SegmentSdMaps
-from tflane_jax.datasets.openlane_settings import OpenLaneV2Config, OpenLaneV2Settings
+from tflane_jax.datasets.openlane_settings import OPENLANE_V2_SIZES, OpenLaneV2Config, OpenLaneV2Settings
 from tflane_jax.datasets.openlane_tracks import SourceTracks
 from tflane_jax.datasets.overlap import frame_drives
 from tflane_jax.datasets.photometric import PhotometricConfig
@@ -46,6 +46,7 @@ from tflane_jax.errors import UserError
 from tflane_jax.files.images import read_image
 from tflane_jax.files.openlane import CENTERLINE, SEGMENT
 from tflane_jax.geometry import relative_pose
+from tflane_jax.limits import Rules
 from tflane_jax.scene import CameraViews, Example
 
 
@@ -251,6 +252,14 @@ class OpenLaneV2Data(OpenLaneV2Settings):
     test: Split = "val"
     image: ImageConfig = field(default=TOPONET_SUBSET_A, kw_only=True)
     augmentation: PhotometricConfig | None = PhotometricConfig()
+
+    def limits(self) -> Rules:
+        """Lanes are learned as the files have them: neither cut to a box nor chosen by kind."""
+        box = OPENLANE_V2_SIZES.range
+        whole = bool(self.example.range.contains(np.stack([box.x, box.y], -1)).all())
+        yield "example.range", whole, f"at least x {box.x}, y {box.y}: labels are not cut to it"
+        yield "example.bike_lanes", self.example.bike_lanes == "include", "'include': labels do not tell bicycle lanes"
+        yield "example.cameras", self.example.cameras is None, "None: `image` says how the files' images are read"
 
     def source(self, split: Split) -> OpenLaneV2Config:
         """Return the dataset of a split."""

@@ -160,7 +160,11 @@ class RealMapData:
     loading: StreamingConfig = StreamingConfig()
 
     def limits(self) -> Rules:
-        """Scenes are long enough for their key frames."""
+        """Scenes are long enough for their key frames; what is said of logs has an effect."""
+        named = {*self.val_logs, *self.test_logs}.isdisjoint(self.without)
+        yield "without", named, "other logs than val_logs and test_logs name"
+        of_recordings = not self.test_traffic or self.test_on == "recordings"
+        yield "test_traffic", of_recordings, "'' where test_on is not recordings: on maps, traffic is simulated"
         yield from scene_limits(self.world, self.example, "world.")
         if self.generated > 0.0:
             yield from scene_limits(self.generated_world, self.example, "generated_world.")

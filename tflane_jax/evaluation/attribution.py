@@ -206,7 +206,7 @@ def lane_scores(
     distance = pair_frechet(np.asarray(lanes, np.float64), found, lane, query).reshape(len(lanes), len(found))
     met = (distance[..., None] <= np.array(LANE_THRESHOLDS)).mean(-1)
     value = met * scores
-    return value.max(1), np.where(met.any(1), value.argmax(1), distance.argmin(1))
+    return value.max(1), np.where(value.max(1) > 0.0, value.argmax(1), distance.argmin(1))
 
 
 def each_alone(road_users: Int[np.ndarray, " n"], tracks: int) -> Bool[np.ndarray, "n k"]:

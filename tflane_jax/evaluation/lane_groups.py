@@ -14,9 +14,9 @@ over `SAMPLES` points, equally spaced along the lane.
 | group | shown fraction | traffic |
 |---|---|---|
 | `hidden+traffic` | below `HALF` | driven fraction at least `HALF` |
-| `hidden-traffic` | below `HALF` | no vehicle came within `NEARBY` of the lane, in any direction |
+| `hidden-traffic` | below `HALF` | no vehicle came within `NEARBY` of the points, in any direction |
 | `visible+traffic`, `visible-traffic` | at least `HALF` | the same |
-| `hidden-neighbours` | below `HALF` | no vehicle came within `NEXT_LANE` of the lane |
+| `hidden-neighbours` | below `HALF` | no vehicle came within `NEXT_LANE` of the points |
 
 Lanes with some traffic, but along less than half of their length, are in none of the first four groups; lanes whose
 boundaries are not known, both without length, are in none at all. Lanes of the control may have traffic in the lane

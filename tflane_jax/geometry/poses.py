@@ -15,7 +15,7 @@ from tflane_jax.geometry.namespace import AnyArray, ArrayT, namespace, product
 
 
 def wrap_angle(angle: Float[np.ndarray, "*b"] | float) -> Float[np.ndarray, "*b"]:
-    """Return the angle in [-pi, pi)."""
+    """Return the angle in [-pi, pi), or pi by rounding."""
     return (np.asarray(angle) + np.pi) % (2 * np.pi) - np.pi
 
 
@@ -77,5 +77,5 @@ def yaw_pose(x: Float[AnyArray, "*b"], y: Float[AnyArray, "*b"], yaw: Float[AnyA
 
 
 def pose_yaw(pose: Float[ArrayT, "*b n n"]) -> Float[ArrayT, "*b"]:
-    """Return the heading of a pose: the direction of its x axis in the ground plane, radians in (-pi, pi]."""
+    """Return the heading of a pose: the direction of its x axis in the ground plane, radians in [-pi, pi]."""
     return namespace(pose).arctan2(pose[..., 1, 0], pose[..., 0, 0])

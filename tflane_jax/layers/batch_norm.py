@@ -75,7 +75,7 @@ class BatchNorm(nn.Module):
             return mean, variance, count
         # Examples differ in the number of views, so sums are added; above, all count alike and means may be averaged.
         counted = valid.reshape((-1,) + (1,) * (x.ndim - 1))
-        count = self._over_batch(valid.sum(dtype=jnp.float32) * (positions / len(valid)), lax.psum)
+        count = self._over_batch(valid.sum(dtype=jnp.float32) * (positions / max(len(valid), 1)), lax.psum)
         total = jnp.maximum(count, 1.0)
         mean = self._over_batch(x.sum(axes, where=counted), lax.psum) / total
         variance = self._over_batch(jnp.square(x - _like(mean, x)).sum(axes, where=counted), lax.psum) / total

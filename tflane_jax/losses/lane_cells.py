@@ -27,8 +27,8 @@ class LaneCells(NamedTuple):
     """Targets of the cells.
 
     Attributes:
-        inside: of all points of lanes, the one nearest to the cell's centre lies in the cell. A lane that only cuts a
-            corner may not count.
+        inside: of some straight piece of a lane, the point nearest to the cell's centre lies in the cell. A lane that
+            only cuts a corner may not count.
         near: a lane passes within 1.5 cells of the cell's centre.
         offset: from the centre to the nearest point of a lane, in cells along x and y; 0 unless `near`.
         direction: unit direction of that lane; 0 unless `near`.

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float
 
+from tflane_jax.errors import UserError
 from tflane_jax.limits import PositiveOrZero
 from tflane_jax.losses.areas import AreaLossConfig, area_loss
 from tflane_jax.losses.auxiliary import auxiliary_losses, denoising_pairs
@@ -120,7 +121,7 @@ class LaneSegNetLossConfig(LaneWeights, HostLossConfig):
         """Return the loss of traffic elements and of their topology with the segments, and its terms."""
         elements, size = true_elements(batch)
         if elements.segment is None:
-            raise ValueError("this loss needs traffic elements that govern segments (ExampleConfig.elements_of)")
+            raise UserError("this loss needs traffic elements that govern segments (ExampleConfig.elements_of)")
         elements = clear_padding(elements)
         found = assign_elements(prediction, elements, size, self.elements, self.matcher)
         terms = element_losses(prediction, found, elements, size, self.elements)

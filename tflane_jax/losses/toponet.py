@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from tflane_jax.errors import UserError
 from tflane_jax.geometry.bezier import bezier_fit
 from tflane_jax.losses.auxiliary import auxiliary_losses, denoising_pairs
 from tflane_jax.losses.common import (
@@ -207,7 +208,7 @@ def element_lane_loss(
     if prediction.lane_logits is None:
         raise ValueError("this loss needs a host that predicts lane-element topology (lane_logits)")
     if elements.lane is None:
-        raise ValueError("this loss needs traffic elements that govern centerlines (ExampleConfig.elements_of)")
+        raise UserError("this loss needs traffic elements that govern centerlines (ExampleConfig.elements_of)")
     layers = prediction.lane_logits.shape[1]
     edges = elements.lane & lanes.valid[:, :, None] & elements.valid[:, None, :]
     rows, columns = last_layers(lane_assignment, layers), last_layers(element_assignment, layers)

@@ -105,6 +105,8 @@ class CenterlineMetrics:
         - only if every frame had traffic elements on both sides: `DET_t` and, per attribute, `DET_t@0` ...
           `DET_t@12`; `TOP_lt` (missing like `TOP_ll`); `OLS`, missing if one of its parts is;
         - `TOP_ll`, `TOP_lt` and `OLS` of the further versions, named with the version: `TOP_ll_v1.0`.
+
+        Raises UserError if some frames alone have traffic elements; so do `compute_sample` and `bootstrap`.
         """
         return self._numbers(np.ones(ATTRIBUTES, bool))
 

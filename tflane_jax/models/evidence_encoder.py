@@ -61,6 +61,7 @@ class EvidenceEncoderConfig:
     def limits(self) -> Rules:
         """Channels split over the groups of the norms, and so over sine and cosine of x and y."""
         yield "dim", self.dim % _GROUPS == 0, f"a multiple of {_GROUPS}, the groups of its norms"
+        yield "dilations", bool(self.dilations or self.levels), "not empty where there are no levels, either"
         split = all(channels % _GROUPS == 0 for channels in self.levels)
         yield "levels", split, f"multiples of {_GROUPS}, the groups of their norms"
 

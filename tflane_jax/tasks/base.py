@@ -149,6 +149,9 @@ class Task(Generic[ExampleT, DataT, SourceT, MemoryT]):
     def check(self, data: SplitData, train: DataT) -> None:
         """Raise UserError if the model cannot be trained on this training split."""
 
+    def check_evaluation(self, data: DataT, config: EvaluationConfig) -> None:
+        """Raise UserError if these examples cannot be evaluated as the settings say."""
+
     def prepare(self, data: SplitData) -> Prepare | None:
         """Return the augmentation of training examples, None for none."""
         return None

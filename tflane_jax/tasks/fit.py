@@ -10,9 +10,11 @@ from jaxtyping import Float
 
 from tflane_jax.datasets.base import ExampleConfig, TruncationWarning
 from tflane_jax.datasets.data_source import LaneGraphSource
+from tflane_jax.datasets.photometric import PhotometricConfig
 from tflane_jax.datasets.sources import source_name
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import PerceptionRange
+from tflane_jax.limits import SettingError
 from tflane_jax.models.bev_encoder import BevFormerConfig
 from tflane_jax.models.bevformer import check_capacity
 from tflane_jax.models.camera_encoder import CameraEncoderConfig
@@ -46,6 +48,16 @@ def check_settings_fit(model: HostConfig, config: ExampleConfig, *, image_scale:
     _check_points(model, config)
     _check_forms(model, config)
     _check_history(model, config)
+
+
+def check_augmentation(model: HostConfig, augmentation: PhotometricConfig | None) -> None:
+    """Raise SettingError where images are augmented in a way that the model cannot know of."""
+    encoder = model.encoder
+    if augmentation is None or not isinstance(encoder, CameraEncoderConfig) or not isinstance(encoder.bev, LiftConfig):
+        return
+    if augmentation.scale != (1.0, 1.0):
+        why = "(1.0, 1.0): the depth network of LiftConfig gets the cameras' own intrinsics by one scale of all images"
+        raise SettingError("data.augmentation.scale", augmentation.scale, why)
 
 
 def check_fit(model: HostConfig, example: Example) -> None:

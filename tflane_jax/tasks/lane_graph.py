@@ -23,7 +23,7 @@ from tflane_jax.datasets.empty_frames import without_empty
 from tflane_jax.datasets.loading import TRAINING_PARTS, keep
 from tflane_jax.datasets.photometric import PhotometricConfig, augment_example
 from tflane_jax.datasets.streaming import Prepare, Streamed
-from tflane_jax.evaluation.interventions import traffic_interventions
+from tflane_jax.evaluation.interventions import traffic_interventions, with_traffic
 from tflane_jax.evaluation.lane_graph import evaluate_lanes
 from tflane_jax.evaluation.results import Evaluation, EvaluationConfig
 from tflane_jax.geometry import PerceptionRange
@@ -42,6 +42,7 @@ from tflane_jax.scene import Example, Prediction, shapes_of, stack_examples
 from tflane_jax.tasks import score_names
 from tflane_jax.tasks.base import Draw, Model, Recorded, Task, spread
 from tflane_jax.tasks.fit import (
+    check_augmentation,
     check_fit,
     check_raster,
     check_settings_fit,
@@ -232,11 +233,16 @@ class LaneGraphTask(Task[Example, Example | Streamed, LaneGraphSource, HostMemor
             warn_of_lanes_beyond(source, example if isinstance(train, Streamed) else train)
         check_fit(self.model, example)
 
+    def check_evaluation(self, data: Example | Streamed, config: EvaluationConfig) -> None:
+        """Raise UserError if the examples cannot give the traffic flow that an evaluation asks for."""
+        with_traffic(data, config.traffic)
+
     def check_settings(self, data: SplitData) -> None:
         """Raise UserError where settings of data and model do not fit together, see `tasks.fit`."""
         source, world = data.source("train"), getattr(data, "world", None)
         images = source.example.cameras or getattr(source, "image", None)
         check_settings_fit(self.model, source.example, image_scale=None if images is None else images.scale)
+        check_augmentation(self.model, getattr(data, "augmentation", None))
         if self.time == "scan" and not self.loops:
             raise SettingError("task.time", self.time, "'unrolled', without clips (task.clip above 1)")
         if world is not None and world.keyframes % self.clip:

@@ -25,7 +25,8 @@ class AdaptiveConfig:
 
     An evaluation after `elapsed` of the `length` steps of a cycle counts if elapsed / length > `grace`. The run and
     each cycle have a reference: their first value that counted, then each value that improves on the reference by more
-    than `threshold` times the reference's size. Smaller gains add up until they do.
+    than `threshold` times the reference's size. Smaller gains add up until they do. Only a value that becomes its
+    cycle's reference can become the run's.
 
     1. Extend: the evaluation becomes the run's reference, the cycle is in its last `fraction` but has not ended, and it
        was extended fewer than `max_extensions` times. The rest of the cycle then takes 1 + `extend` times as long, at

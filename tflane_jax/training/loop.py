@@ -30,7 +30,7 @@ from tflane_jax.training.checkpoint import Checkpoints
 from tflane_jax.training.fine_tuning import origins, starting_params
 from tflane_jax.training.interrupt import StopRequest
 from tflane_jax.training.manifest import Manifest
-from tflane_jax.training.notices import NO_BEST, due_notices, not_finite, only_told, print_notices
+from tflane_jax.training.notices import due_notices, missing_scores, not_finite, only_told, print_notices
 from tflane_jax.training.records import Record, RecordWriter, Unwritten, Window, by_name, read_records, seed_record
 from tflane_jax.training.restarts import adapt
 from tflane_jax.training.resumption import carried, latest
@@ -286,8 +286,8 @@ def train(
                     raise
                 evaluations = from_first(lambda: measured)
                 writer.write(seed_record(step, "val", scores := by_name(evaluations)))
-                if not metrics and config.best_metric not in scores and is_first():
-                    print_notices([NO_BEST.format(step, config.best_metric)])
+                if not metrics and is_first():
+                    print_notices(missing_scores(step, scores, config.best_metric, adaptive))
                 metrics = {name: float(np.mean(values)) for name, values in scores.items()}
                 if adaptive is not None:
                     together = of_all_seeds([state.opt_state for state in states])

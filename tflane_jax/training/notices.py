@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +13,29 @@ import numpy as np
 from tflane_jax.errors import UserError
 from tflane_jax.startup import write
 from tflane_jax.training.records import Record
+from tflane_jax.training.restarts import RestartsConfig
 
-NO_BEST = (
-    "step {}: the evaluation has no {} (training.best_metric), so no checkpoint is the best; it stays so if the "
-    "validation examples have no such lanes: then choose another score"
-)
+
+def missing_scores(step: int, scores: Collection[str], best: str, restarts: RestartsConfig | None) -> list[str]:
+    """Return what to say of an evaluation that lacks a score by which a training goes on.
+
+    Args:
+        step: of the evaluation.
+        scores: that it gives.
+        best: `training.best_metric`.
+        restarts: their adaptive rule has a score, too; None for none.
+    """
+    reasons = [(best, "training.best_metric", "no checkpoint is the best")]
+    if restarts is not None and restarts.adaptive is not None:
+        reasons.append(
+            (restarts.adaptive.metric, "optim.restarts.adaptive.metric", "the rule takes it for no improvement")
+        )
+    return [
+        f"step {step}: the evaluation has no {score} ({setting}), so {result}; it stays so if the validation examples "
+        "have no such lanes: then choose another score"
+        for score, setting, result in reasons
+        if score not in scores
+    ]
 
 
 def not_finite(

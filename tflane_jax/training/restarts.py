@@ -12,6 +12,7 @@ another compilation.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, NamedTuple
@@ -21,7 +22,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int
 
-from tflane_jax.errors import UserError
 from tflane_jax.limits import Fraction, at_least, below
 from tflane_jax.training.adaptive import AdaptiveConfig, Memory, extended_rest, judge
 
@@ -177,31 +177,22 @@ def adapt(
     Args:
         config: with `adaptive`.
         opt_state: of the optimiser, with a leading seed axis where there are several seeds.
-        memories, evaluations: one per seed.
+        memories, evaluations: one per seed; an evaluation without the rule's metric is no improvement.
         steps: of the run.
 
     Returns:
         The optimiser's new state (same shapes and types: no compilation), the new memories, and the cycles as they
         are now, for the record: `number`, `length`, `magnitude` and `extensions`, one value per seed.
-
-    Raises:
-        UserError: the evaluation has no number of that name.
     """
     adaptive = config.adaptive
     assert adaptive is not None
-    for evaluation in evaluations:
-        if adaptive.metric not in evaluation:
-            raise UserError(
-                f"optim.restarts.adaptive.metric is {adaptive.metric}, which the evaluation does not give: "
-                f"choose one of {', '.join(sorted(evaluation))}"
-            )
     cycle: Any = jax.device_get(cycle_of(opt_state))
     count, start, length, number = (np.atleast_1d(v) for v in (cycle.count, cycle.start, cycle.length, cycle.number))
     judged = [
         judge(
             adaptive,
             memory,
-            evaluation[adaptive.metric],
+            evaluation.get(adaptive.metric, math.nan),
             number=int(number[i]),
             elapsed=int(count[i] - start[i]),
             length=int(length[i]),

@@ -69,13 +69,15 @@ class OptimConfig:
             "linear", times B / reference_batch (Goyal et al. 2017, for SGD); "sqrt", times the square root of it, often
             used with Adam.
         reference_batch: examples of an update that `lr` was chosen for. None, where `lr_scaling` is set by an override
-            (`--optim.lr_scaling`) or in a configuration file: those that the file has as `training.batch_size`.
+            (`--optim.lr_scaling`) or in a configuration file: those that the file, or the ablation named in it, has as
+            `training.batch_size`.
         lr_factors: (pattern, factor) pairs. The parameters of a module whose path matches the pattern, for example
             `encoder/images/backbone`, learn at `factor` times the rate, their weight decay included; `*` stands for any
             text, the first pattern that matches decides, and 0 keeps parameters as they are. Every pattern must match.
         warmup_steps: steps of linear rise from `warmup_ratio * lr` to `lr`.
         warmup_ratio: first learning rate relative to `lr`.
-        final_ratio: last learning rate relative to `lr`; `restarts` have their own.
+        final_ratio: learning rate, relative to `lr`, that the cosine reaches at the end of the run, after the last
+            update; `restarts` have their own, `drops` have none.
         weight_decay: on the parameters that `decayed` names.
         decayed: "kernels" and embeddings, or "all", biases and norms too, as the published camera hosts train.
         decay: "decoupled" from the gradient (AdamW), or "coupled": added to it, after clipping (PyTorch's Adam,

@@ -54,8 +54,9 @@ class RoadConfig:
     Attributes:
         kinds: scene kinds with their relative frequencies.
         reach: distance from the central feature to the border of the map.
-        ego_reach: distance from the central feature up to which ego routes run; `reach - ego_reach` must cover half
-            the diagonal of the perceived box.
+        ego_reach: distance from the central feature up to which ego routes run. Where a drive does not reach the end of
+            its roads, key frames may lie beyond it. Where `reach - ego_reach` is less than half the diagonal of the
+            perceived box, or a frame lies beyond, the border of the map may cut lanes inside the box.
         vertex_spacing: largest distance between vertices of a line.
         lane_width: vehicle lanes.
         single_lane_width: the same on streets with at most one lane in each direction; None: no difference.

@@ -132,7 +132,7 @@ class RealMapData:
         maps: folder of logs: Argoverse 2, nuScenes, OpenLane-V2, or lanes as GeoJSON.
         train, val, test: number of scenes of each split.
         val_logs, test_logs: names of the logs of these splits.
-        without: names of logs that no split takes.
+        without: names of logs that no split takes, unless `val_logs` or `test_logs` names them.
         test_on: whether the test split is simulated on maps, or is what was recorded: the logs' own key frames and
             tracks, see `recorded_logs`.
         test_traffic: name of a log whose recorded tracks replace those of the test split's logs, a control: plausible
@@ -160,9 +160,7 @@ class RealMapData:
     loading: StreamingConfig = StreamingConfig()
 
     def limits(self) -> Rules:
-        """Scenes are long enough for their key frames; what is said of logs has an effect."""
-        named = {*self.val_logs, *self.test_logs}.isdisjoint(self.without)
-        yield "without", named, "other logs than val_logs and test_logs name"
+        """Scenes are long enough for their key frames; traffic of another log needs recordings."""
         of_recordings = not self.test_traffic or self.test_on == "recordings"
         yield "test_traffic", of_recordings, "'' where test_on is not recordings: on maps, traffic is simulated"
         yield from scene_limits(self.world, self.example, "world.")

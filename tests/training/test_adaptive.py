@@ -204,9 +204,11 @@ def test_seeds_have_cycles_of_their_own(whole, tmp_path):
     assert len(checkpoints.manifest(30).progress["cycles"]) == 2
 
 
-def test_a_missing_metric_is_named(tmp_path):
-    with pytest.raises(UserError, match=r"adaptive\.metric is loss, which .* choose one of score$"):
-        run_cycles(tmp_path / "run", evaluate=score)
+def test_a_missing_metric_is_named_and_ends_no_run(tmp_path, capsys):
+    run_cycles(tmp_path / "run", evaluate=score)
+    assert (
+        "no loss (optim.restarts.adaptive.metric), so the rule takes it for no improvement" in capsys.readouterr().err
+    )
     with pytest.raises(UserError, match="needs evaluations"):
         run_cycles(tmp_path / "other", evaluate=None)
     assert not (tmp_path / "other").exists()

@@ -63,7 +63,7 @@ def run(options: argparse.Namespace) -> int:
     print(format_table(rows, title=title))
     counts = [row[kind] for row in rows for kind in ("lanes", "lines") if kind in row]
     if counts and not any(counts):
-        print(f"tflane: warning: {name} has no true lane: these scores are conventions", file=sys.stderr)
+        print(f"tflane: warning: {name} has no true lane: scores are those of an empty truth", file=sys.stderr)
     if near is not None:
         print(f"\n{near.sentence()}")
     meta = {

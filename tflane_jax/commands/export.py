@@ -24,7 +24,8 @@ from tflane_jax.export import (
     scene_program,
     serialized_model,
 )
-from tflane_jax.files.atomic import replacing, write_bytes
+from tflane_jax.files.atomic import write_bytes
+from tflane_jax.files.npz import write_npz
 from tflane_jax.plots.tables import format_table, save_table
 from tflane_jax.runs import Run
 from tflane_jax.scene import stack_examples
@@ -72,8 +73,7 @@ def run(options: argparse.Namespace) -> int:
     print(f"\n{out}: {len(content) / 1e6:.1f} MB, the model's numbers within {difference:.1g}; table in {written[0]}")
     if isinstance(program.inputs, dict):
         answers = {f"answer/{name}": np.asarray(array)[0] for name, array in exported.items()}
-        with replacing(example) as temporary, open(temporary, "wb") as file:
-            np.savez_compressed(file, **program.inputs, **answers)
+        write_npz(example, program.inputs | answers)
         print(f"one frame and its answer in {example}")
     return 0
 

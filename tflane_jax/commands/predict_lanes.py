@@ -29,7 +29,6 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any, cast
 
 import jax
@@ -46,7 +45,8 @@ from tflane_jax.errors import UserError
 from tflane_jax.evaluation.geometric_topology import Topology, edge_confidences
 from tflane_jax.evaluation.interventions import dataset_with_traffic
 from tflane_jax.evaluation.predict import predict_examples
-from tflane_jax.files.atomic import replacing, write_json
+from tflane_jax.files.atomic import write_json
+from tflane_jax.files.npz import write_npz
 from tflane_jax.plots import save_camera_views, save_examples
 from tflane_jax.plots.segments import true_lanes
 from tflane_jax.plots.tables import counted
@@ -85,10 +85,10 @@ def predict(trained: Run, options: argparse.Namespace) -> int:
     ]
 
     make_folder(options.out)
-    _save_arrays(options.out / "predictions.npz", arrays)
+    write_npz(options.out / "predictions.npz", arrays)
     truth = _truth(examples, lanes_of(answer), arrays)
     if truth is not None:
-        _save_arrays(options.out / "truth.npz", truth | {name: arrays[name] for name in ("scene", "timestamp_ns")})
+        write_npz(options.out / "truth.npz", truth | {name: arrays[name] for name in ("scene", "timestamp_ns")})
     head = {"run": trained.name, "step": trained.step, "seed": trained.config.training.seeds[0]}
     write_json(options.out / "predictions.json", head | {"threshold": options.threshold, "frames": frames})
     pictures = _draw(options, source, dataset, indices, examples, answer, model_title(trained))
@@ -191,9 +191,3 @@ def _best_first(scores: Float[np.ndarray, " q"], threshold: float) -> Int[np.nda
 def _relations(scores: Float[np.ndarray, "a b"], first: str, second: str) -> list[dict[str, Any]]:
     pairs = np.argwhere(scores >= _RELATION_THRESHOLD).tolist()
     return [{first: i, second: j, "score": float(scores[i, j])} for i, j in pairs]
-
-
-def _save_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
-    # An open file, because numpy would append .npz to the temporary name.
-    with replacing(path) as temporary, open(temporary, "wb") as file:
-        np.savez_compressed(file, **arrays)  # pyright: ignore[reportArgumentType]

@@ -42,7 +42,7 @@ class EvaluationConfig:
 
 
 def in_all_versions(scores: Iterable[str]) -> list[str]:
-    """Return names of scores, each followed by its names in every version of the metrics (`versions`, the second)."""
+    """Return names of scores, each followed by the names that it has as a score of a further version (`versions`)."""
     return [name for score in scores for name in (score, *(f"{score}_{version}" for version in get_args(Version)))]
 
 

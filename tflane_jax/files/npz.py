@@ -1,10 +1,10 @@
-"""Arrays of .npz files from elsewhere: nothing is unpickled, and sizes are checked before memory is taken for them."""
+"""Arrays in .npz files: of files from elsewhere nothing is unpickled, and sizes are checked before memory is taken."""
 
 from __future__ import annotations
 
 import math
 import zipfile
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import IO
 
@@ -12,6 +12,7 @@ import numpy as np
 from numpy.lib import format as npy
 
 from tflane_jax.errors import UserError
+from tflane_jax.files.atomic import replacing
 
 # Bytes of memory that a file's arrays may take: 200 frames of 10,000 lanes of 200 points are 10 GB.
 _MOST_MEMORY = 2**34
@@ -104,3 +105,10 @@ def _check_header(archive: zipfile.ZipFile, part: zipfile.ZipInfo) -> None:
             has = f"but the file has {part.file_size - content.tell()} for it"
             raise ValueError(f"{part.filename} claims {claimed:.2g} bytes, {has}")
         check_places(shape, part.file_size)
+
+
+def write_npz(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
+    """Write arrays by name, compressed, whole or not at all."""
+    # An open file, because numpy would append .npz to the temporary name.
+    with replacing(path) as temporary, open(temporary, "wb") as file:
+        np.savez_compressed(file, **arrays)  # pyright: ignore[reportArgumentType]

@@ -40,7 +40,7 @@ CASES = {
     "cameras": (
         CAMERA_TOPONET,
         make_camera_example,
-        {*VIEWS, *TRAFFIC, "previous_from_ego"},
+        {*VIEWS, *TRAFFIC},
         {*GRAPH, "box", "attribute_score", "element_lane"},
     ),
 }

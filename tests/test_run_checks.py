@@ -234,6 +234,10 @@ def test_there_are_enough_cases():
         (["--optim.lr", "-1"], ["--optim.lr is -1.0", "at least 0"]),
         (["--task.model.decoder.heads", "7"], ["--task.model.decoder.heads is 7", "divisor of dim (64)"]),
         (["--training.best_metric", "all/DETl"], ["training.best_metric is 'all/DETl'", "did you mean all/DET_l"]),
+        (
+            ["--data.world.terrain", "default", "--data.example.markers", "default"],
+            ["--data.world.terrain is TerrainConfig", "it must be None, or example.markers None", "level ground"],
+        ),
         (["--training.init-from", "no/run"], ["training.init_from is no/run", "holds no run", "tflane convert"]),
         (["--optim.bl", "0.5"], ["unknown setting --optim.bl", "--optim.b1"]),
         (["--optim.lr", "fast"], ["--optim.lr", "fast"]),

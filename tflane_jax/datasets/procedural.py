@@ -132,7 +132,7 @@ def _simulated(scene_id: int, config: WorldConfig, history: int) -> Log:
 
 
 def scene_limits(world: WorldConfig, example: ExampleConfig, name: str) -> Rules:
-    """Yield the limits of key frames and histories in scenes of the built-in world.
+    """Yield the limits of key frames, histories and markers in scenes of the built-in world.
 
     Args:
         world: of the scenes.
@@ -148,6 +148,8 @@ def scene_limits(world: WorldConfig, example: ExampleConfig, name: str) -> Rules
     allowed = f"at most {most}: scenes of {world.duration_s:g} s ({name}duration_s) have {world.frames} frames, "
     allowed += f"{history} of them before the first key frame (example.history, example.history_hz)"
     yield f"{name}keyframes", world.keyframes <= most, allowed
+    level = world.terrain is None or example.markers is None
+    yield f"{name}terrain", level, "None, or example.markers None: markers are simulated on level ground only"
 
 
 @dataclass(frozen=True)
@@ -169,7 +171,7 @@ class WorldData:
     loading: StreamingConfig = StreamingConfig()
 
     def limits(self) -> Rules:
-        """Scenes are long enough for their key frames."""
+        """Scenes are long enough for their key frames; markers stand on level ground."""
         yield from scene_limits(self.world, self.example, "world.")
 
     def source(self, split: Split) -> ProceduralConfig:

@@ -64,7 +64,8 @@ class BevFormer(nn.Module):
             UserError: more cameras, or another number of levels, than configured.
         """
         config = self.config
-        memory = memory or _no_memory(config)
+        if memory is None:
+            memory, previous_from_ego = _no_memory(config)
         # An invalid memory's pose may be anything.
         pose = jnp.where(memory.valid, previous_from_ego, jnp.eye(4, dtype=previous_from_ego.dtype))
         history = BevMemory(jnp.where(memory.valid, memory.features, 0.0), memory.valid)
@@ -114,9 +115,9 @@ class BevFormer(nn.Module):
         return encoded.reshape(grid.rows, grid.columns, config.dim)
 
 
-def _no_memory(config: BevFormerConfig) -> BevMemory:
-    # The barrier keeps XLA from simplifying the zeros away, so that rounding is the same as with an invalid memory.
-    return lax.optimization_barrier(BevMemory.empty(config))
+def _no_memory(config: BevFormerConfig) -> tuple[BevMemory, Float[Array, "4 4"]]:
+    # The barrier keeps XLA from simplifying the constants away, so that rounding is the same as with an invalid memory.
+    return lax.optimization_barrier((BevMemory.empty(config), jnp.eye(4)))
 
 
 class MotionEmbedding(nn.Module):

@@ -309,7 +309,7 @@ def test_check_counts_and_lists_every_fault(root, capsys):
     text = capsys.readouterr().out
     assert "3 faults" in text
     assert "boston-seaport.json is missing" in text
-    assert "scene-0061: 1 images are missing (first samples/CAM_FRONT/a2.jpg)" in text
+    assert "scene-0061 lacks 1 image (first samples/CAM_FRONT/a2.jpg)" in text
     assert "row sample-b1: its timestamp is not later" in text
 
 

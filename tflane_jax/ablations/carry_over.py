@@ -42,6 +42,7 @@ from tflane_jax.ablations.store import remaining_seconds, runs_elsewhere
 from tflane_jax.ablations.workers import noted, train_all, worker_threads
 from tflane_jax.errors import UserError
 from tflane_jax.evaluation.interventions import NO_TRAFFIC
+from tflane_jax.files.wording import counted
 from tflane_jax.plots.tables import format_table, save_table
 from tflane_jax.progress import progress_bar
 from tflane_jax.runs import open_run
@@ -106,8 +107,8 @@ def carry_over(settings: Settings, out: Path) -> Path:
     seconds, guesses = remaining_seconds(by_row, dict.fromkeys(by_row, _MINUTES))
     basis = "a guess" if guesses else "by the runs so far"
     print(
-        f"{len(plan.flat())} runs, {complete} complete; the others take about {seconds / 3600 / settings.jobs:.1f} h "
-        f"({settings.jobs} at a time; {basis})",
+        f"{counted(len(plan.flat()), 'run')}, {complete} complete; the others take about "
+        f"{seconds / 3600 / settings.jobs:.1f} h ({settings.jobs} at a time; {basis})",
         flush=True,
     )
 

@@ -16,6 +16,7 @@ from tflane_jax.config import RunConfig, load_config
 from tflane_jax.datasets.real_maps import RealMapData
 from tflane_jax.datasets.road_maps import find_maps
 from tflane_jax.errors import UserError
+from tflane_jax.files.wording import counted
 
 ROWS: Mapping[str, str] = {
     "generated": "real_maps:generated",
@@ -141,7 +142,9 @@ def recorded_logs(settings: Settings) -> Plan:
     maps = find_maps(settings.maps)
     names = tuple(one.name for one in maps if one.recorded)
     if len(names) < 2:
-        raise UserError(f"{settings.maps} has {len(names)} recorded logs: to leave one out, there must be two or more")
+        raise UserError(
+            f"{settings.maps} has {counted(len(names), 'recorded log')}: to leave one out, there must be two or more"
+        )
     if settings.folds is not None and not 2 <= settings.folds <= len(names):
         raise UserError(f"--folds {settings.folds}: {settings.maps} has {len(names)} logs, so 2 to {len(names)} folds")
     if unknown := set(settings.logs) - set(names):

@@ -19,6 +19,7 @@ from tflane_jax.config_io import first_difference, to_json
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import write_json
 from tflane_jax.files.fields import load_json
+from tflane_jax.files.wording import counted
 from tflane_jax.runs import current_form
 from tflane_jax.training.provenance import provenance
 
@@ -95,13 +96,12 @@ class Declared:
             what += f", secondary measure {self.declaration.secondary}{late}"
         if self.declaration.negative_control is not None:
             what += f", negative control {self.declaration.negative_control}"
-        runs = "1 run" if self.begun == 1 else f"{self.begun} runs"
-        when = "before any run" if self.begun == 0 else f"when {runs} had begun already"
+        when = "before any run" if self.begun == 0 else f"when {counted(self.begun, 'run')} had begun already"
         names = dict.fromkeys(claim.treatment for claim in self.declaration.claims)
         treatments = ", ".join(f'"{name}"' if "," in name else name for name in names)
-        seeds = "1 seed" if len(self.seeds) == 1 else f"{len(self.seeds)} seeds"
         what += f", treatment {treatments}" if names else ", no claim"
-        text = f"Declared {when} ({self.time}): {what}, level {self.declaration.alpha:g}, {seeds}."
+        text = f"Declared {when} ({self.time}): {what}, level {self.declaration.alpha:g}, "
+        text += f"{counted(len(self.seeds), 'seed')}."
         if _CONFIGURATIONS in self.missing:
             text += " This declaration of an earlier version holds no configurations: those of the rows may be later."
         return text

@@ -66,9 +66,10 @@ def mixed_hosts(rows: Sequence[TableRow], trained: Mapping[str, Sequence[Job]]) 
     sentences = []
     for host, by_seed in found.items():
         if mixed := sorted(seed for seed, origins in by_seed.items() if len(origins) > 1):
-            seeds = f"seed{'s' if len(mixed) > 1 else ''} {', '.join(map(str, mixed))}"
+            seeds = "seed" if len(mixed) == 1 else "seeds"
             sentences.append(
-                f"Rows of {seeds} do not all start from one known training of {host}: they may differ by their hosts."
+                f"Rows of {seeds} {', '.join(map(str, mixed))} do not all start from one known training of {host}: "
+                "they may differ by their hosts."
             )
     return sentences
 

@@ -166,4 +166,5 @@ def measured_elsewhere(runs: Sequence[Job]) -> list[str]:
         for job, measured in found
         if measured is not None and (job.recorded is not None or measured.code != code_digest())
     }
-    return [f"measured by code of digest{'s' * (len(codes) > 1)} {' and '.join(sorted(codes))}"] if codes else []
+    digests = "digest" if len(codes) == 1 else "digests"
+    return [f"measured by code of {digests} {' and '.join(sorted(codes))}"] if codes else []

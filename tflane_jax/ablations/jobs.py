@@ -21,6 +21,7 @@ from tflane_jax.config_io import first_difference, to_json
 from tflane_jax.datasets.sources import source_of
 from tflane_jax.errors import UserError
 from tflane_jax.evaluation.results import EvaluationConfig
+from tflane_jax.files.wording import counted
 from tflane_jax.run_checks import check_rate_factors, check_run
 from tflane_jax.runs import check_origin, current_form
 from tflane_jax.training.checkpoint import Checkpoints
@@ -235,7 +236,8 @@ def plan_jobs(
     differences = [(job, text) for planned in plan.values() for job in planned if (text := job.difference())]
     if differences and not retrain:
         job, text = differences[0]
-        more = f", and so do {len(differences) - 1} other folders" if len(differences) > 1 else ""
+        others = counted(len(differences) - 1, "other folder")
+        more = f" (beside {others} of this kind)" if len(differences) > 1 else ""
         hint = "; --test evaluates finished runs on other data" if text.startswith("data.test") else ""
         raise UserError(
             f"{job.folder} holds a run of another configuration ({text}){more}: choose another folder with --out, or "

@@ -18,8 +18,9 @@ from tflane_jax.ablations.verdicts import verdicts
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import write_text
 from tflane_jax.files.fields import load_json, member
+from tflane_jax.files.wording import counted
 from tflane_jax.plots.claims import save_claims
-from tflane_jax.plots.tables import counted, format_table
+from tflane_jax.plots.tables import format_table
 
 _WIDTH = 120
 _CLAIMS = (

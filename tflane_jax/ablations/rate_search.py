@@ -23,6 +23,7 @@ from tflane_jax.ablations.store import stored_jobs
 from tflane_jax.ablations.table_plan import seed_by_seed
 from tflane_jax.ablations.workers import train_all, worker_threads
 from tflane_jax.errors import UserError
+from tflane_jax.files.wording import counted
 from tflane_jax.plots.tables import format_table, save_table
 from tflane_jax.training.records import read_records
 
@@ -48,7 +49,7 @@ def search_rates(table: PaperTable, out: Path, *, jobs: int = 1, cores: int | No
     plan = plan_search(table, out, jobs=jobs, cores=cores, quick=quick)
     assert table.search is not None
     every = seed_by_seed({f"{row}, {rate}": jobs for row, by_rate in plan.items() for rate, jobs in by_rate.items()})
-    print(f"{table.name}: {len(every)} trainings for the learning rates of {len(plan)} rows", flush=True)
+    print(f"{table.name}: {counted(len(every), 'training')} for the learning rates of {len(plan)} rows", flush=True)
     failures = train_all(every, jobs, cores)
     rows = rated(table.search, plan)
     folder = (out / "quick" if quick else out) / table.name

@@ -11,6 +11,7 @@ from tflane_jax.ablations.jobs import file_names
 from tflane_jax.ablations.results import Results
 from tflane_jax.ablations.scores import CHECKPOINTS, OWN_TEST
 from tflane_jax.files.atomic import write_json
+from tflane_jax.files.wording import counted
 from tflane_jax.plots.tables import format_table, save_table
 from tflane_jax.tasks import Task
 
@@ -57,7 +58,9 @@ def _save_table(
     remarks: Mapping[str, Mapping[str, str]],
     stem: Path,
 ) -> Path:
-    title = f"{results.protocol(test)}, {results.title(test)}, {_count(results.seeds)}, percent (mean ± std)"
+    title = (
+        f"{results.protocol(test)}, {results.title(test)}, {counted(len(results.seeds), 'seed')}, percent (mean ± std)"
+    )
     rows: list[dict[str, Any]] = []
     for which in CHECKPOINTS:
         for row, by_seed in results.rows(test, which).items():
@@ -98,7 +101,7 @@ def _save_paired(results: Results, test: str, metrics: Sequence[str], task: Task
             rows.append({"checkpoint": which} | row | part)
     if not rows:
         return []
-    over = "the seeds that both have" if any("seeds" in row for row in rows) else _count(results.seeds)
+    over = "the seeds that both have" if any("seeds" in row for row in rows) else counted(len(results.seeds), "seed")
     title = f"{results.protocol(test)}, {results.title(test)}: paired differences to {control}, two-sided t-test "
     title = _with_warning(f"{title}over {over}; p (Holm) is corrected for all tests of one checkpoint", results, test)
     print("\n" + format_table(rows, title=title, digits=4))
@@ -109,10 +112,6 @@ def _with_warning(title: str, results: Results, test: str) -> str:
     """Return the title of a table, with a sentence below if its rows are measured by several protocols."""
     mixed = results.mixed_protocols(test)
     return f"{title}\n\n{mixed}" if mixed else title
-
-
-def _count(seeds: Sequence[int]) -> str:
-    return f"{len(seeds)} seed{'s' if len(seeds) > 1 else ''}"
 
 
 def listed(seeds: Sequence[int] | Mapping[int, Any]) -> str:

@@ -18,8 +18,9 @@ from tflane_jax.config_help import meaning
 from tflane_jax.config_io import first_difference, to_json
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import check_folder
+from tflane_jax.files.wording import counted
 from tflane_jax.migrations import value_at
-from tflane_jax.plots.tables import counted, format_table, save_table
+from tflane_jax.plots.tables import format_table, save_table
 from tflane_jax.progress import progress_bar
 from tflane_jax.runs import Run, open_run
 

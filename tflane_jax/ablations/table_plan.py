@@ -17,6 +17,7 @@ from tflane_jax.ablations.store import remaining_seconds, runs_elsewhere, settin
 from tflane_jax.ablations.workers import worker_threads
 from tflane_jax.config import RunConfig
 from tflane_jax.errors import UserError
+from tflane_jax.files.wording import counted
 
 
 @dataclass(frozen=True)
@@ -177,7 +178,7 @@ def tell_work(plan: TablePlan, seeds: Sequence[int], store: Path, jobs: int, *, 
     """
     every, table = plan.every(), plan.table
     complete = sum(job.is_complete() for job in every)
-    text = f"{table.name}, {table.title}: {len(every)} runs, {complete} complete"
+    text = f"{table.name}, {table.title}: {counted(len(every), 'run')}, {complete} complete"
     if recorded := sum(job.recorded is not None for job in every):
         text += f" ({recorded} of them recorded)"
     if complete < len(every) and quick:

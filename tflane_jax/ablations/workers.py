@@ -25,6 +25,7 @@ from tflane_jax.ablations.training_queue import Queue
 from tflane_jax.child_processes import end_with_parent, spared_interrupts
 from tflane_jax.config_io import first_difference
 from tflane_jax.errors import Interrupted, UserError
+from tflane_jax.files.wording import counted
 from tflane_jax.memory import give_back_freed_memory, huge_pages_for_children, keep_freed_memory
 from tflane_jax.progress import progress_bar
 from tflane_jax.run_checks import check_run
@@ -103,7 +104,7 @@ def _train_here(queue: Queue, finished: Finished | None) -> list[Failure]:
     while len(queue):
         if (job := queue.take()) is None:
             if not waits:
-                write(f"waiting for {len(queue)} runs that other processes train")
+                write(f"waiting for {counted(len(queue), 'run')} that other processes train")
             waits = True
             time.sleep(_POLL_SECONDS)
             continue
@@ -132,7 +133,7 @@ def _train_in_workers(
         total, done = sum(job.config.training.steps for job in jobs), sum(job.resumes_at() for job in jobs)
         anew = {job.place for job in jobs if job.start() == "overwrite"}  # their folders hold records of other runs
         bar = stack.enter_context(
-            progress_bar(total=total, initial=done, desc=f"train and measure {len(jobs)} runs", unit="step")
+            progress_bar(total=total, initial=done, desc=f"train and measure {counted(len(jobs), 'run')}", unit="step")
         )
         while len(queue) or any(worker.job for worker in workers):
             for worker in workers:

@@ -19,8 +19,9 @@ from tflane_jax.datasets.base import SPLITS
 from tflane_jax.datasets.batches import prepared
 from tflane_jax.datasets.overlap import overlap, read_drives
 from tflane_jax.errors import UserError
+from tflane_jax.files.wording import counted
 from tflane_jax.plots import dataset_summary, format_table, save_camera_views, save_table, show_dataset
-from tflane_jax.plots.tables import counted, written_to
+from tflane_jax.plots.tables import written_to
 from tflane_jax.scene import RoadImage, stack_examples
 from tflane_jax.tasks import spread
 from tflane_jax.tasks.lane_pictures import titles

@@ -15,6 +15,7 @@ from tflane_jax.config_overrides import apply_overrides
 from tflane_jax.datasets import sources
 from tflane_jax.errors import UserError
 from tflane_jax.evaluation.example_statistics import example_stats
+from tflane_jax.files.wording import counted
 from tflane_jax.plots import format_table
 from tflane_jax.scene import RoadImage
 from tflane_jax.tasks import spread
@@ -37,10 +38,10 @@ def stats(options: argparse.Namespace, overrides: Sequence[str]) -> int:
     indices = spread(len(dataset), options.count)
     if not indices:
         raise UserError(f"nothing to count: {dataset.name} has {len(dataset)} examples, {options.count} asked for")
-    counted = [example_stats(dataset.example(index), source.example) for index in indices]
-    names = dict.fromkeys(name for one in counted for name in one)
-    rows = [_row(name, np.array([one[name] for one in counted if name in one])) for name in names]
-    print(format_table(rows, title=f"{data_name(source, options)}: {len(indices)} examples"))
+    found = [example_stats(dataset.example(index), source.example) for index in indices]
+    names = dict.fromkeys(name for one in found for name in one)
+    rows = [_row(name, np.array([one[name] for one in found if name in one])) for name in names]
+    print(format_table(rows, title=f"{data_name(source, options)}: {counted(len(indices), 'example')}"))
     return 0
 
 

@@ -31,7 +31,7 @@ from tflane_jax.datasets.plausible import LARGEST_DISTORTION, MOST_PIXELS
 from tflane_jax.errors import LeftOutWarning, UserError
 from tflane_jax.files.atomic import check_folder, check_replaces, write_bytes, write_json
 from tflane_jax.files.images import check_centre, list_photos, opencv, read_image, undistorted
-from tflane_jax.files.wording import check_name, plain_name, short_stem
+from tflane_jax.files.wording import check_name, counted, plain_name, short_stem
 from tflane_jax.geometry.cameras import project
 from tflane_jax.limits import check_settings
 from tflane_jax.markers.curves import CurveConfig, Sighting, measure, summarise
@@ -41,7 +41,6 @@ from tflane_jax.markers.square_pose import marker_outline
 from tflane_jax.plots import format_table, save_table, style
 from tflane_jax.plots.marker_curves import save_error_curves
 from tflane_jax.plots.marker_drive import OUTCOMES
-from tflane_jax.plots.tables import counted
 from tflane_jax.scene import CameraViews
 from tflane_jax.scene.marker_patterns import MarkerFamily, board_size
 from tflane_jax.world.render.camera import camera_pose

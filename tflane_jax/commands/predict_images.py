@@ -19,8 +19,8 @@ from tflane_jax.datasets import sources
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import write_text
 from tflane_jax.files.tusimple import RowLanes
+from tflane_jax.files.wording import counted
 from tflane_jax.plots.images import save_road_images
-from tflane_jax.plots.tables import counted
 from tflane_jax.runs import Run
 from tflane_jax.scene import stack_examples
 from tflane_jax.tasks import spread

@@ -47,9 +47,9 @@ from tflane_jax.evaluation.interventions import dataset_with_traffic
 from tflane_jax.evaluation.predict import predict_examples
 from tflane_jax.files.atomic import write_json
 from tflane_jax.files.npz import write_npz
+from tflane_jax.files.wording import counted
 from tflane_jax.plots import save_camera_views, save_examples
 from tflane_jax.plots.segments import true_lanes
-from tflane_jax.plots.tables import counted
 from tflane_jax.runs import Run
 from tflane_jax.scene import Example, LinePrediction, Prediction
 from tflane_jax.tasks import spread

@@ -31,10 +31,9 @@ from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import check_replaces, write_json
 from tflane_jax.files.images import LARGEST_SIDE, PHOTO_SUFFIXES, list_photos, opencv, read_image
 from tflane_jax.files.videos import VIDEO_SUFFIXES, read_frames, sample_frames, video_info, writing_video
-from tflane_jax.files.wording import check_name, plain_name, short_stem
+from tflane_jax.files.wording import check_name, counted, plain_name, short_stem
 from tflane_jax.plots.figure import new_figure
 from tflane_jax.plots.images import lanes_drawn, save_photo
-from tflane_jax.plots.tables import counted
 from tflane_jax.progress import progress_bar
 from tflane_jax.runs import Run
 from tflane_jax.tasks.photo_lanes import PhotoLanes, PhotoReader

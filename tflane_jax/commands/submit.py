@@ -23,6 +23,7 @@ from tflane_jax.evaluation.interventions import with_traffic
 from tflane_jax.evaluation.lane_segments import detections_of_segments
 from tflane_jax.evaluation.predict import predicted_batches
 from tflane_jax.evaluation.vector_maps import detections_of_lines
+from tflane_jax.files.wording import counted
 from tflane_jax.metrics.map_matching import MapDetections
 from tflane_jax.progress import progress_bar
 from tflane_jax.runs import Run
@@ -92,7 +93,7 @@ def run(options: argparse.Namespace) -> int:
         raise UserError(
             "frames of OpenLane-V2 and nuScenes alone can be submitted: add --root and the dataset's folder"
         )
-    print(f"{len(dataset)} frames of {dataset.name} written to {options.out}")
+    print(f"{counted(len(dataset), 'frame')} of {dataset.name} written to {options.out}")
     return 0
 
 

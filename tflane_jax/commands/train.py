@@ -20,6 +20,7 @@ from tflane_jax.config_help import explained
 from tflane_jax.config_io import from_json, to_json
 from tflane_jax.config_overrides import apply_overrides, batch_notices
 from tflane_jax.errors import UserError
+from tflane_jax.files.wording import counted
 from tflane_jax.own_modules import imports_of
 from tflane_jax.plots.tables import format_table
 from tflane_jax.runs import resumable_config, train_run
@@ -67,7 +68,8 @@ def _trained(options: argparse.Namespace, overrides: Sequence[str]) -> int:
     if not processes.is_first():
         return 0
     print(
-        f"{out}: {result.step} steps, {result.steps_per_second:.2f} steps/s, compiled in {result.compile_seconds:.1f} s"
+        f"{out}: {counted(result.step, 'step')}, {result.steps_per_second:.2f} steps/s, "
+        f"compiled in {result.compile_seconds:.1f} s"
     )
     if result.metrics:
         several = f", mean of {len(config.training.seeds)} seeds" if len(config.training.seeds) > 1 else ""
@@ -112,7 +114,7 @@ def _print_devices() -> None:
     number, devices = jax.process_count(), jax.devices()
     if processes.is_first() and (number > 1 or len(devices) > 1 or devices[0].platform != "cpu"):
         joined = f"{number} processes, " if number > 1 else ""
-        write(f"{joined}{len(devices)} device{'s' * (len(devices) > 1)} ({devices[0].device_kind})")
+        write(f"{joined}{counted(len(devices), 'device')} ({devices[0].device_kind})")
 
 
 def _saved_at(out: Path) -> int | None:

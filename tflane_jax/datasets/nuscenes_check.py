@@ -15,6 +15,7 @@ from tflane_jax.datasets.openlane_check_cameras import damage_of, image_size
 from tflane_jax.datasets.plausible import FAR, check_place
 from tflane_jax.datasets.view_images import ImageConfig
 from tflane_jax.errors import UserError
+from tflane_jax.files.wording import counted
 from tflane_jax.progress import progress_bar
 
 
@@ -54,7 +55,7 @@ def check_nuscenes(root: Path) -> FolderCheck:
             continue
         absent = [] if skipped else missing_images(tables, frames.samples)
         if absent:
-            faults.append(f"{name}: {len(absent)} images are missing (first {absent[0]})")
+            faults.append(f"{name} lacks {counted(len(absent), 'image')} (first {absent[0]})")
         if not skipped:
             faults += [f"{name}: {fault}" for fault in _camera_faults(tables, frames)]
         count.update({"key frames": tracks.frames, "road users": len(tracks.uuid)})

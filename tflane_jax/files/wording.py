@@ -70,6 +70,11 @@ def named(name: Any) -> str:
     return f"{text if plain else repr(text):.{_LONGEST_NAME}}"
 
 
+def counted(number: int, thing: str, things: str = "") -> str:
+    """Return a number of things in words: "1 frame", "2 frames"; `things` is the plural where it does not end in s."""
+    return f"{number} {thing if number == 1 else things or thing + 's'}"
+
+
 def first_of(names: Sequence[Any]) -> str:
     """Return the first few of several names."""
     return ", ".join(map(named, names[:_NAMED])) + (", ..." if len(names) > _NAMED else "")

@@ -11,11 +11,11 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from tflane_jax.errors import UserError
+from tflane_jax.files.wording import counted
 from tflane_jax.metrics.directions import lower_is_better, unit_of
 from tflane_jax.plots import style
 from tflane_jax.plots.figure import columns_for, hide_unused, new_figure, save_figure
 from tflane_jax.plots.names import score_title
-from tflane_jax.plots.tables import counted
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

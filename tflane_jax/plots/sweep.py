@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
+from tflane_jax.files.wording import counted
 from tflane_jax.metrics.directions import unit_of
 from tflane_jax.plots import style
 from tflane_jax.plots.figure import columns_for, hide_unused, new_figure, save_figure
 from tflane_jax.plots.names import score_title
-from tflane_jax.plots.tables import counted
 
 Scores = Mapping[str, Sequence[Sequence[Mapping[str, float]]]]
 """By model: for each value of the setting, for each seed, metrics by name."""

@@ -102,11 +102,6 @@ def written_to(paths: Sequence[Path]) -> str:
     return f"written to {', '.join(first)} and {last}" if first else f"written to {last}"
 
 
-def counted(number: int, thing: str) -> str:
-    """Return a number of things in words: "1 frame", "2 frames"."""
-    return f"{number} {thing}{'' if number == 1 else 's'}"
-
-
 def _line(cells: Iterable[str], widths: list[int], right: list[bool]) -> str:
     placed = (
         cell.rjust(width) if r else cell.ljust(width) for cell, width, r in zip(cells, widths, right, strict=True)

@@ -153,7 +153,7 @@ def save(out: Path, name: str, record: dict[str, Any], table: str) -> None:
 
 
 def load_notice(record: Mapping[str, Any]) -> str:
-    """Return a sentence if the cores were busier than a benchmark alone keeps them, by what `machine` says, or none."""
+    """Return a warning if other programs ran (the load of `machine` is above its cores), else ""."""
     of = record.get("machine", record)
     load, count = of.get("load", [0.0])[0], of.get("cores", 0)
     if load <= count + 0.5:  # the benchmark itself counts

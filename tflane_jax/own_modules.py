@@ -232,7 +232,10 @@ def _module_name(path: Path) -> str:
 
 
 class _Loader(importlib.machinery.SourceFileLoader):
-    """Compiles the source itself: cached byte code is told from the source by its time, in seconds, and size."""
+    """Always compiles the source.
+
+    Python takes cached byte code if the source's time (in whole seconds) and size match: it would miss a quick edit.
+    """
 
     def get_code(self, fullname: str) -> Any:
         return self.source_to_code(self.get_data(self.path), self.path)

@@ -67,7 +67,7 @@ CLAIMS = (
 FITTED = (
     "The settings of generated roads (preset real-like) and of traffic were fitted to mean statistics of nine logs "
     "(docs/real_roads.md), and scenes with left-hand traffic were added after a model had failed on five of them: a "
-    "tested log that is one of the nine is known that far."
+    "tested log that is one of the nine is not wholly unseen."
 )
 """What the models know of the logs that they are tested on, for every page."""
 # Models to draw, preferred first; the first two with a run are drawn.

@@ -71,7 +71,7 @@ class Job:
 
     @property
     def place(self) -> Path:
-        """The folder with its absolute path, by which runs that start from it are told."""
+        """Absolute path of the folder; runs that start from this one name it."""
         return self.folder.resolve()
 
     @property
@@ -120,7 +120,9 @@ class Job:
     def _other_files(self) -> str:
         """Return that files of the training data have changed since; "" if they have not, or nothing tells."""
         checkpoints, split = Checkpoints(self.folder / "checkpoints"), self.config.data.source("train")
-        with contextlib.suppress(UserError):  # no files any more; a damaged checkpoint is told where its run is used
+        with contextlib.suppress(
+            UserError
+        ):  # files are gone, or the checkpoint is damaged: reported when the run is used
             for step in checkpoints.steps()[-1:]:
                 trained_on = checkpoints.manifest(step).progress.get("content")  # earlier versions wrote down none
                 if trained_on and trained_on != source_of(split).content(split):
@@ -144,7 +146,7 @@ class Job:
         checkpoints, last = Checkpoints(self.folder / "checkpoints"), self.config.training.steps
         if not self.exists() or checkpoints.steps()[-1:] != [last] or self.difference():
             return False
-        with contextlib.suppress(UserError):  # a damaged one is told where its run is used
+        with contextlib.suppress(UserError):  # a damaged checkpoint is reported when the run is used
             return not checkpoints.manifest(last).progress.get("due")
         return True
 

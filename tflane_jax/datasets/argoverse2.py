@@ -1,4 +1,4 @@
-"""Argoverse 2 sensor logs as a dataset of lane graphs, with the images of the ring cameras where they are there."""
+"""Argoverse 2 sensor logs as a dataset of lane graphs, with the images of the ring cameras, if the logs have them."""
 
 from __future__ import annotations
 

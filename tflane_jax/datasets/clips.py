@@ -56,8 +56,8 @@ class ClipDataset:
 def as_clips(data: Example | Streamed, length: int) -> Example | Streamed:
     """Return the examples of a split as clips of `length` successive frames, another axis behind the first.
 
-    Of data on disk, the last frames of a scene that fill no clip are left out. Clips are told from those of other
-    scenes by `KnownScenes`, or by reading every frame's `info`.
+    Of data on disk, the last frames of a scene that fill no clip are left out. Scene boundaries come from
+    `KnownScenes`, or else from every frame's `info`.
 
     Raises UserError where clips of data in memory would not lie within scenes, or no scene on disk is long enough.
     """

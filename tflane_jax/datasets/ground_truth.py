@@ -134,9 +134,9 @@ def _crop(lanes: MapLanes, ego_from_global: np.ndarray, range_: PerceptionRange)
 def _boundary_of(part: np.ndarray, line: np.ndarray, whole: np.ndarray, range_: PerceptionRange) -> np.ndarray:
     """Return the piece of a boundary that belongs to a piece of its centerline.
 
-    If several pieces of the boundary are inside the range, the one nearest to the middle of the centerline's piece; if
-    none is that lies beside this piece, the part of the boundary at the same fractions of its length. A boundary that
-    stays inside while its centerline leaves the range and returns is given whole to each piece of the centerline.
+    Of several pieces inside the range, it is the one nearest to the middle of the centerline's piece. If no piece lies
+    beside it, it is the part of the boundary at the same fractions of its length. A boundary that stays inside while
+    its centerline leaves the range and returns is given whole to each piece of the centerline.
     """
     inside = clip_to_range(line, range_)
     if len(inside) == 1 and np.array_equal(part, whole):
@@ -168,7 +168,7 @@ def _lies_beside(piece: np.ndarray, whole: np.ndarray, start: float, stop: float
 def _position_along(line: np.ndarray, point: np.ndarray, stretch: tuple[float, float] | None = None) -> float:
     """Return the arc length at which a line passes nearest to a point.
 
-    With `stretch`, a range of arc lengths, of places about as near the one that is nearest to it.
+    With `stretch` (a range of arc lengths): of several places that are about equally near, the one closest to it.
     """
     step = np.diff(line[:, :2], axis=0)
     fraction, distance = segment_distances(point[:2], line[:-1, :2], step)

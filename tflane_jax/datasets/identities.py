@@ -82,8 +82,8 @@ class Identities:
 def pairs_within(apart: Float[np.ndarray, "n m"], limit: float) -> dict[int, int]:
     """Return the column of each row that has one nearer than a limit.
 
-    The pairs have the least sum of distances, where all pairs beyond the limit count alike: how far items are that came
-    or went does not matter to those that stay.
+    The pairs minimise the sum of distances clipped at the limit, so that items which appear or disappear do not affect
+    the others.
     """
     from scipy.optimize import linear_sum_assignment
 

@@ -1,7 +1,7 @@
 """Check a folder of OpenLane-V2: counts of each split, and one sentence for each fault.
 
-Every frame's files are read as for training. Of images only header and last bytes are read unless they are wanted as a
-whole, so a subset takes minutes. Both subsets may share the folder: every segment is checked by its own.
+Every frame's files are read as for training. By default only the header and the last bytes of an image are read, so
+that a subset takes minutes. A folder may hold both subsets; each segment is checked against its own.
 """
 
 from __future__ import annotations
@@ -54,8 +54,7 @@ class OpenLaneCheck:
         subset: "A", "B" or "A and B", by the cameras of each segment's first frame.
         rows: counts of each split, and of each subset where there are both, for a table.
         faults: sentences, each naming a file.
-        skipped: files that are none of the dataset's, what was not read, the logs that frames lack, and
-            frames that a training would not see.
+        skipped: foreign files, files that were not read, missing logs, and frames that training would not see.
     """
 
     subset: str

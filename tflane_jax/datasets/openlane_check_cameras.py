@@ -30,11 +30,12 @@ _FRAME_STARTS, _SCAN = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}, 0xDA
 # In the compressed data of a scan: a marker other than a stuffed byte, a restart, or one that begins the next segment
 # of a progressive file (tables, scan) or ends the image; and a hole.
 _STRANGE = re.compile(rb"\xff[^\x00\xd0-\xd9\xda\xc4\xdb\xdd\xfe\xff]|\x00{4096}")
-# Degrees between the optical axis and where a camera of this name looks; a fraction of the image's size between its
-# middle and the principal point; metres from the vehicle's origin, and from where the datasets' cameras of this name
-# are, which differ by centimetres; focal length in widths of the image, and relative to
-# that of the datasets' cameras of this name, which differ by 3 %.
-_TURNED, _ASIDE, _FARTHEST, _MOVED, _FOCAL, _NOMINAL = 35.0, 0.15, 5.0, 0.4, (0.25, 4.0), 0.1
+_TURNED = 35.0  # degrees between the optical axis and the nominal direction
+_ASIDE = 0.15  # principal point from the image's middle, fraction of its size
+_FARTHEST = 5.0  # metres from the vehicle's origin
+_MOVED = 0.4  # metres from the nominal place; those of the datasets' vehicles differ by centimetres
+_FOCAL = (0.25, 4.0)  # focal length, widths of the image
+_NOMINAL = 0.1  # deviation from the nominal focal length, as a fraction; those of the datasets' cameras differ by 3 %
 _MOUNTS = {mount.name: mount for mount in (*ARGOVERSE2_RING, *NUSCENES_RING)}
 
 

@@ -1,4 +1,4 @@
-"""What a folder of OpenLane-V2 tells of how it is to be read: its subset, and the preset of its images."""
+"""Subset and image preset of a folder of OpenLane-V2, from its files."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def preset_of(root: Path, split: Split, subset: SubsetName) -> ImageConfig:
     try:
         front = read_frame(root, key, subset, suffix).cameras[0]
         official = front is None or read_image(front.image).shape[1::-1] == SUBSETS[subset].sizes[0]
-    except UserError:  # whoever reads the frames says what is wrong with them
+    except UserError:  # reported when the frames are read
         official = True
     return preset if official else replace(preset, front_rows=None)
 

@@ -50,7 +50,7 @@ class EdgeTypes:
 
 
 def weights_edge_types(model: LstrConfig) -> bool:
-    """Return whether a model's encoder weights its edge types: not so the transformer and the GCN."""
+    """Return whether a model's encoder weights its edge types: GTN and HAN do, transformer and GCN do not."""
     return isinstance(model.encoder, (GtnEncoderConfig, HanEncoderConfig))
 
 

@@ -58,7 +58,7 @@ def load_members(path: Path, names: Sequence[str]) -> Mapping[str, Any]:
             name, at = decoder.raw_decode(text, at)
             value, at = decoder.raw_decode(text, _past(text, at, ":"))
             found[name] = value
-    except (ValueError, TypeError, RecursionError):  # it ends here, or there is a mistake, which is told by:
+    except (ValueError, TypeError, RecursionError):  # the object ends here, or the text is invalid, which this reports:
         found = parse_json(text, str(path))
     return {name: found[name] for name in names if name in found} if isinstance(found, Mapping) else found
 

@@ -156,8 +156,8 @@ def unused_changes(folder: Path, used: dict[str, Any], current_form: CurrentForm
 def with_same_origin(saved: dict[str, Any], resolved: dict[str, Any], folder: Path) -> dict[str, Any]:
     """Return a saved configuration (JSON) with `training.init_from` as `resolved` has it, where both mean one run.
 
-    That is a run beside `folder`. Where it lies is told by its name alone, because a folder of runs may be moved, or
-    have another path on another machine.
+    They mean one run if both lie beside `folder` under the same name; paths may differ, because folders of runs are
+    moved between machines.
     """
     old, new = (config.get("training", {}).get("init_from") for config in (saved, resolved))
     if not isinstance(old, str) or not isinstance(new, str) or Path(old).name != Path(new).name:

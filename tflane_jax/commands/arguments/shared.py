@@ -118,7 +118,7 @@ def example_arguments(parser: argparse.ArgumentParser, split: str) -> None:
 
 
 def split_arguments(parser: argparse.ArgumentParser, split: str, further: str = "") -> None:
-    """Add the arguments that select one split of the data; `split` is the default, `further` ends what help says."""
+    """Add the arguments that select one split of the data; `split` is the default, `further` is appended to help."""
     # No argparse default: an explicit --split is an error for data without splits, the default split is not.
     parser.add_argument("--split", choices=("train", "val", "test"), help=f"default {split}{further}")
     parser.set_defaults(default_split=split)

@@ -9,7 +9,7 @@ import pytest
 
 from tests.shared import assert_same
 from tflane_jax.datasets import cache, sources
-from tflane_jax.datasets.front_views import FrontViewConfig, FrontViewDataset, load_road_images
+from tflane_jax.datasets.front_views import FrontViewConfig, FrontViewData, FrontViewDataset, load_road_images
 from tflane_jax.datasets.leaves import IMAGE_PARTS, example_leaves, image_from_leaves
 from tflane_jax.datasets.streaming import StreamingConfig
 from tflane_jax.errors import UserError
@@ -21,6 +21,11 @@ SMALL = FrontViewConfig(split="val", images=3, first=5)
 @pytest.fixture(autouse=True)
 def own_cache(tmp_path, monkeypatch):
     monkeypatch.setenv("TFLANE_CACHE", str(tmp_path))
+
+
+def test_settings_of_the_world_reach_every_split():
+    data = FrontViewData(world=FrontWorldConfig(severity=1.0))
+    assert {data.source(split).world for split in ("train", "val", "test")} == {FrontWorldConfig(severity=1.0)}
 
 
 def test_splits_own_disjoint_ranges_of_ids():

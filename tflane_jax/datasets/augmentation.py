@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 
 from tflane_jax.files.images import opencv
 from tflane_jax.limits import Factor, Fraction, PositiveOrZero, within
@@ -70,8 +70,9 @@ def augment(
 ) -> RoadImage:
     """Return one example with random changes; the same seed gives the same bits.
 
-    Points that leave the image become invalid. Rows stay ascending within a line, and lines stay sorted from left to
-    right by their first point. A line of several points of which the warp leaves one or none is dropped.
+    Points that leave the image become invalid. Rows stay ascending within a line; where a strong rotation bends one
+    back to rows that it had, its far part is left out. Lines stay sorted from left to right by their first point. A
+    line of several points of which the warp leaves one or none is dropped.
 
     Args:
         example: numpy.
@@ -148,6 +149,8 @@ def warp_lines(lines: LaneLines, warp: Float[np.ndarray, "3 3"], height: int, wi
 
     # Strong rotations can swap the rows of points: sort the valid ones among their own places.
     places = np.argsort(~valid, axis=-1, kind="stable")
+    valid = _before_the_bend(points[..., 1], valid, places)
+    places = np.argsort(~valid, axis=-1, kind="stable")
     order = np.argsort(np.where(valid, points[..., 1], np.inf), axis=-1, kind="stable")
     arranged = np.zeros_like(points)
     np.put_along_axis(arranged, places[..., None], np.take_along_axis(points, order[..., None], 1), 1)
@@ -160,6 +163,23 @@ def warp_lines(lines: LaneLines, warp: Float[np.ndarray, "3 3"], height: int, wi
     kept, valid, points = kept[across], valid[across], points[across]
     valid &= kept[:, None]
     return LaneLines(np.where(valid[..., None], points, 0.0).astype(np.float32), valid, kept)
+
+
+def _before_the_bend(
+    row: Float[np.ndarray, "l p"], valid: Bool[np.ndarray, "l p"], places: Int[np.ndarray, "l p"]
+) -> Bool[np.ndarray, "l p"]:
+    """Return the valid points up to where a line, seen from its last point (the nearest), turns back to rows it had.
+
+    A line has one point in a row. `places` has the valid points of each line first, in their order.
+    """
+    step = np.diff(np.take_along_axis(row, places, -1))
+    steps = np.arange(step.shape[-1]) < valid.sum(-1, keepdims=True) - 1
+    last = np.take_along_axis(step, np.maximum(valid.sum(-1, keepdims=True) - 2, 0), -1) if step.size else 0.0
+    turns = steps & (step * last < 0.0)
+    beyond = np.logical_or.accumulate(turns[:, ::-1], -1)[:, ::-1]
+    kept = valid.copy()
+    np.put_along_axis(kept, places[:, :-1], np.take_along_axis(valid, places[:, :-1], -1) & ~beyond, -1)
+    return kept
 
 
 def colour_map(

@@ -130,6 +130,7 @@ class FrontViewData:
 
     Attributes:
         train, val, test: number of images of each split.
+        world: camera, road, traffic and weather of the images.
         augmentation: of training images, or None.
         loading: memory or disk, and workers; "auto" leaves the images on disk, mapped into memory.
     """
@@ -137,12 +138,13 @@ class FrontViewData:
     train: Count = 4000
     val: Count = 100
     test: Count = 400
+    world: FrontWorldConfig = FrontWorldConfig()
     augmentation: AugmentationConfig | None = AugmentationConfig()
     loading: StreamingConfig = StreamingConfig()
 
     def source(self, split: Split) -> FrontViewConfig:
         """Return the dataset of a split."""
-        return FrontViewConfig(split, images=getattr(self, split), loading=self.loading)
+        return FrontViewConfig(split, images=getattr(self, split), world=self.world, loading=self.loading)
 
 
 def _load(

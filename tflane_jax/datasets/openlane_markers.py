@@ -40,8 +40,8 @@ class BoardsConfig:
         seed: of ids, small deviations of the boards, and the noise of their detection, with the segment's name.
         placement: as in the built-in world. With `site` "clear", a board moves along the lane and back from it until
             the segment's own frames, 8 to 50 m before it, have it in their images; where no frame passes, it stays.
-        lane_width: assumed, metres: the files of centerlines have no boundaries. A board stands half of it, the road's
-            edge (0.5 m) and `placement.setback` to the right of the rightmost lane.
+        lane_width: assumed width of a lane, metres: the files of centerlines have no boundaries. A board stands half of
+            it, the road's edge (0.5 m) and `placement.setback` to the right of the rightmost lane.
     """
 
     seed: Seed = 0

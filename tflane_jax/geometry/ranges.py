@@ -15,7 +15,7 @@ class PerceptionRange:
     """Axis-aligned box in the ego frame, metres: R_p of TF-Lane (section 3.2).
 
     Attributes:
-        x, y, z: (low, high) per axis.
+        x, y, z: (low, high) of each axis, metres.
     """
 
     x: Interval = (-50.0, 50.0)
@@ -52,7 +52,7 @@ class BevGrid:
 
     Attributes:
         range: the box covered; TopoNet's +-51.2 x +-25.6 m.
-        rows, columns: cells along y and x.
+        rows, columns: number of cells along y and x.
     """
 
     range: PerceptionRange = PerceptionRange((-51.2, 51.2), (-25.6, 25.6), (-2.3, 1.7))

@@ -55,7 +55,7 @@ class PolylineEncoderConfig:
 
     Attributes:
         dim: channels of a token.
-        layers, heads, hidden, dropout: of the transformer.
+        layers, heads, hidden, dropout: sizes and dropout of the transformer.
         bands, temperature, layout: of the encoding of points; 0 bands leave their coordinates as they are.
         attend: what attends to each other: "lines" (SMERF), or the "points" of one line (marker fusion).
     """

@@ -30,8 +30,8 @@ class ResNetConfig:
 
     Attributes:
         blocks: blocks of each stage.
-        channels: of each stage (before a bottleneck's expansion by 4).
-        strides: of each stage.
+        channels: channels of each stage (before a bottleneck's expansion by 4).
+        strides: stride of each stage.
         stem_channels: of the 7x7 convolution with stride 2.
         block: "basic" (ResNet-18, 34) or "bottleneck" (50, 101, 152).
         frozen_stem_norm: the norm after the stem is constant, as in the published LSTR, where it is the identity up to

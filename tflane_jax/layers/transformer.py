@@ -22,7 +22,7 @@ class TransformerConfig:
     """Sizes of a layer; the defaults are LSTR's.
 
     Attributes:
-        heads: of every attention.
+        heads: heads of every attention.
         hidden: hidden channels of the feed-forward network.
         dropout: probability for attention weights, hidden channels and each residual branch.
         norm_first: pre-norm (normalise the input of each residual branch) instead of post-norm (normalise the sum).

@@ -31,7 +31,7 @@ class AreaLossConfig:
     """Weights of matching costs and loss terms; the defaults are the variant's.
 
     Attributes:
-        class_weight, points_weight: of both cost and loss; points in metres, summed over coordinates.
+        class_weight, points_weight: weights of both cost and loss; points in metres, summed over coordinates.
         direction_weight, least_step: see `MapTrLossConfig`.
         rings: directions in which a true ring may be matched.
         class_target: see `MapTrLossConfig`.

@@ -25,7 +25,7 @@ class LaneShapeLossConfig:
     """Weights of both matching costs and loss terms; the defaults are LSTR's.
 
     Attributes:
-        class_weight: omega_1.
+        class_weight: omega_1, weight of the classes.
         curve_weight: omega_2, for columns as fractions of the image width, summed over the points of a lane.
         extent_weight: omega_3, for the rows where a lane begins and ends.
         cell_weight: weight of the auxiliary loss on cells, for networks that have it; LSTR does not.

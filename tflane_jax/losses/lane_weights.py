@@ -15,8 +15,8 @@ class LaneWeights:
     """Weights of matching costs and loss terms; a loss derives from this and from `HostLossConfig`.
 
     Attributes:
-        class_weight, points_weight: of both cost and loss; points in metres, summed over coordinates.
-        successor_weight, element_lane_weight: of the topology of lanes, and of that with traffic elements.
+        class_weight, points_weight: weights of both cost and loss; points in metres, summed over coordinates.
+        successor_weight, element_lane_weight: weights of the topology of lanes, and of that with traffic elements.
         alpha, gamma: parameters of the focal terms of lanes. Traffic elements have their own; those of areas (0.25, 2)
             and of the heat map of proposals (2) are fixed.
         matcher: backend of `matching.match`.
@@ -26,7 +26,7 @@ class LaneWeights:
             precision (Li et al. 2020, quality focal loss).
         class_mean: the class losses are divided by the matched lanes of each "frame", as in the published training, or
             of the "batch", see `losses.common.over_matched`.
-        proposal_weight: of the heat map of lane proposals; their shapes have `points_weight`.
+        proposal_weight: weight of the heat map of lane proposals; their shapes have `points_weight`.
         cell_weight: of the auxiliary loss on BEV cells, if the host has it (`losses.lane_cells`).
     """
 

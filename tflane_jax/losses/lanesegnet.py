@@ -61,11 +61,11 @@ class LaneSegNetLossConfig(LaneWeights, HostLossConfig):
     """Weights of matching costs and loss terms; the defaults are LaneSegNet's.
 
     Attributes:
-        mask_weight, dice_weight: of both cost and loss.
-        type_weight: of the line types of either boundary.
+        mask_weight, dice_weight: weights of both cost and loss of masks.
+        type_weight: weight of the line types of either boundary.
         dice_cost: the dice cost takes the masks' "logits", as the published configuration does, or their
             "probabilities", as the dice loss does.
-        raster: of the mask targets.
+        raster: how the mask targets are drawn.
         areas: weights of areas, where the model predicts them.
         others: see `LaneWeights`. Points are those of all three lines. The loss of both topologies is that of the
             published code; `class_mean` holds for line types, and for the pairs of both topologies, too.

@@ -43,11 +43,12 @@ class MapTrLossConfig(HostLossConfig):
     """Weights of matching costs and loss terms; the defaults are MapTR's.
 
     Attributes:
-        class_weight, points_weight: of both cost and loss; points in fractions of the range, summed over coordinates.
-        direction_weight: of the steps' directions.
-        least_step: metres. The gradient of a direction grows as 1 / length of the predicted step; shorter steps than
-            this count less. The default is PyTorch's epsilon, with which a single pair of coinciding points, as lines
-            have them in a corner of the range, can exceed all other gradients.
+        class_weight, points_weight: weights of both cost and loss; points in fractions of the range, summed over
+            coordinates.
+        direction_weight: weight of the steps' directions.
+        least_step: length below which steps count less for the direction, metres. The gradient of a direction grows as
+            1 / length of the predicted step. The default is PyTorch's epsilon, with which a single pair of coinciding
+            points, as lines have them in a corner of the range, can exceed all other gradients.
         alpha, gamma: parameters of every focal term.
         rings: directions in which a true ring may be matched, see `geometry.line_orders`: "one" as MapTR does, "both"
             for truth whose rings turn either way.

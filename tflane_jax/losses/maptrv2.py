@@ -25,11 +25,11 @@ class MapTrV2LossConfig(MapTrLossConfig):
 
     Attributes:
         many_repeats: k, how often every true line is repeated for the one-to-many group.
-        many_weight: of all terms of that group.
-        mask_weight: of the mask on the BEV features.
+        many_weight: weight of all terms of the one-to-many group.
+        mask_weight: weight of the mask on the BEV features.
         mask_positive: weight of a cell with a line in it, relative to one without.
         view_mask_weight, view_mask_positive: the same of the masks on the feature maps of the images.
-        depth_weight: of the depth of image cells.
+        depth_weight: weight of the depth of image cells.
         others: see `MapTrLossConfig`.
     """
 

@@ -26,7 +26,7 @@ class ElementLossConfig:
     """Weights of both matching costs and loss terms; the defaults are TopoNet's.
 
     Attributes:
-        class_weight, box_weight, iou_weight: of class, L1 and generalised IoU.
+        class_weight, box_weight, iou_weight: weights of class, L1 and generalised IoU.
         alpha, gamma: parameters of the focal terms.
         empty_frames: frames without elements. "keep": their queries are negatives of the class loss; "skip": they have
             no loss, and losses are divided by the number of frames where that is larger than that of matched elements,

@@ -41,7 +41,7 @@ class MarkerSimulationConfig:
         jump: probability of an abrupt jump (paper: 0.05 a frame), on top of the other errors.
         jump_distance: of a jump, in a random direction in the ground plane, metres (paper: about 25).
         jump_yaw: of a jump, degrees (paper: about 90), to the left or right by the octant of its direction.
-        jump_spread: relative standard deviation of both.
+        jump_spread: relative standard deviation of the jump in position and in yaw.
         detection_sigma: sigma_d of P = exp(-d^2 / (2 sigma_d^2)), metres. The paper fits it but does not report it. The
             default puts P = 1/2 at 47 m, where a 1 m marker is 38 pixels wide in the front camera of Argoverse 2, some
             5 pixels for each of the 7 cells of a 5x5 ArUco marker.
@@ -101,11 +101,12 @@ class MarkerConfig:
     """The marker prior of an example: detections are simulated, or found in images with `pixels`.
 
     Attributes:
-        markers, lanes, points: capacities M and J, and points P on each lane. With boards on both sides of junctions,
-            no frame of 320 had more than two in sight (docs/markers.md); a marker has at most 34 lanes in range. Beyond
-            the capacities the farthest markers, and the lanes farthest from their marker, are dropped.
+        markers, lanes, points: capacities: M markers, J lanes of each, and P points on each lane. With boards on both
+            sides of junctions, no frame of 320 had more than two in sight (docs/markers.md); a marker has at most 34
+            lanes in range. Beyond the capacities the farthest markers, and the lanes farthest from their marker, are
+            dropped.
         radius: lanes within this distance of a marker are stored, metres.
-        simulation: of the detections; with `pixels` only its residual settings apply.
+        simulation: simulation of the detections; with `pixels` only its residual settings apply.
         pixels: detect the boards in native images of the built-in world's cameras instead; None simulates.
     """
 

@@ -49,8 +49,8 @@ class BevFormerConfig:
         temporal_points: sampling points per head and frame.
         spatial_points: sampling points per head and level, a multiple of `anchors`.
         anchors: points per pillar, at different heights.
-        attention: to the cameras. "deformable": BEVFormer's; "kernel": the geometry-guided kernel of MapTR, with a head
-            for each anchor and one feature level. It does not use `spatial_points`.
+        attention: attention of the queries to the cameras. "deformable": BEVFormer's; "kernel": the geometry-guided
+            kernel of MapTR, with a head for each anchor and one feature level. It does not use `spatial_points`.
         kernel: rows and columns of the kernel.
         levels: feature levels of an image.
         cameras: largest number of cameras; each has its own embedding.
@@ -58,9 +58,9 @@ class BevFormerConfig:
             `bevformer.check_capacity` checks it against a frame.
         memory: "previous": temporal attention reads the BEV features of the previous frame; "off": every frame stands
             alone, as in a host that was trained on single frames. The parameters are the same.
-        motion: what is embedded in the queries. "moved": the motion since the previous frame, 0 without one. "can_bus":
-            heading, acceleration, rates and velocity, as for published weights (`VehicleState.can_bus`), and no motion
-            since the previous frame.
+        motion: motion of the vehicle that is embedded in the queries. "moved": the motion since the previous frame, 0
+            without one. "can_bus": heading, acceleration, rates and velocity, as for published weights
+            (`VehicleState.can_bus`), and no motion since the previous frame.
         align: how previous features are brought into the present frame, see the module docstring.
         rotation_center: centre of the rotation as (column, row), in cells from the grid's corner, unless `align` is
             "warp"; None: the vehicle. TopoNet's published (50, 100) on 200 x 100 cells is not the vehicle.

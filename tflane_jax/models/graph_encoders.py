@@ -54,7 +54,7 @@ class GtnEncoderConfig:
         relations: structural edge types to select from.
         similarity: attention over all cells as an additional, last edge type: offered to the last hop only, to every
             hop (the same attention), or to none (None), for a purely structural graph.
-        heads: of similarity; one head for all channels is cheapest.
+        heads: heads of similarity; one for all channels is cheapest.
         head_dim: channels of query and key of a head, as in LSTR's attention.
         hidden: hidden channels of the feed-forward network.
         dropout: probability for attention weights, hidden channels and each residual branch.
@@ -135,7 +135,7 @@ class HanEncoderConfig:
 
     Attributes:
         layers: encoder layers.
-        heads: of node-level attention.
+        heads: heads of node-level attention.
         relations: meta-paths: `near` is the cell and its 8 neighbours, `row` and `column` lie along an axis; `near+row`
             is composed of two edges, of which the first one acts first.
         semantic: channels of semantic-level attention.

@@ -48,9 +48,10 @@ class HostConfig:
         range: R_p, the box in which lanes are perceived, metres.
         priors: traffic flow, SD map, markers; none of them gives the vision-only baseline.
         elements: decoder of traffic elements, which needs cameras; None: no traffic elements.
-        initial: the start of training. "lecun": kernels are normal, biases 0. "xavier", as in the published code:
-            kernels of the decoders' transformer layers are Xavier-uniform, feed-forward biases and heads have PyTorch's
-            default, and heads are equal in all layers. Only `init` of the host itself applies it, see `Host.init`.
+        initial: initial values of the parameters. "lecun": kernels are normal, biases 0. "xavier", as in the published
+            code: kernels of the decoders' transformer layers are Xavier-uniform, feed-forward biases and heads have
+            PyTorch's default, and heads are equal in all layers. Only `init` of the host itself applies it, see
+            `Host.init`.
     """
 
     encoder: EncoderConfig = EvidenceEncoderConfig()

@@ -53,7 +53,7 @@ class LaneDecoderConfig:
         output: "sigmoid" adds the change of a lane to the logit of its reference, as in Deformable DETR. "metric" adds
             it in units of `metres` and clips at the border of the perception range, where the sigmoid is flat: lanes
             that leave the range end there.
-        metres: unit of change along x, y and z of output "metric".
+        metres: unit of change along x, y and z where the output is "metric".
         proposals: queries from a heat map of lanes beside the learned ones; None for learned ones only.
         dropout: probability, for attention weights, hidden channels, messages and every residual branch.
         precision: dtype of linear layers, see `layers.precision`; parameters, points and scores are float32.

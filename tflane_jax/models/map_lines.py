@@ -39,7 +39,7 @@ class LineDecoderConfig:
         layers: decoder layers.
         queries: lines I.
         points: points P of a line; the decoder has I P queries.
-        coordinates: of a point, x and y, or x, y and z.
+        coordinates: number of coordinates of a point: x and y, or x, y and z.
         classes: of `scene.LineClass`, the first three or four; two for areas (`models.area_decoder`).
         class_layers: hidden layers of the class branch.
         sampling_points: deformable sampling points per head.
@@ -47,11 +47,11 @@ class LineDecoderConfig:
         anchors: "linear": a point starts at the sigmoid of a linear function of its embedding, and its position
             encoding stays, as in MapTR. "spread": the points start on learned lines, initially straight ones spread
             over the range, and the position encoding follows them from layer to layer.
-        bands: frequencies per coordinate of that encoding.
+        bands: frequencies per coordinate of the position encoding of a refined line.
         output: "sigmoid" adds the change of a point to the logit of its reference, as in MapTR; "metric" adds it in
             units of `metres` and clips at the border of the perception range, see `LaneDecoderConfig.output`; "raw" is
             a fault that published weights need, see `models.area_decoder`.
-        metres: unit of change along x, y and z of output "metric".
+        metres: unit of change along x, y and z where the output is "metric".
         dropout: probability, for attention weights, hidden channels and every residual branch.
         precision: dtype of linear layers, see `layers.precision`; parameters, points and scores are float32.
         remat: recompute each layer's activations for the gradient instead of keeping them.

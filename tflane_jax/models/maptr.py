@@ -63,8 +63,8 @@ class MapTrConfig(HostConfig):
         decoder: decoder of map lines.
         denoising: noised lines in training (`models.lane_denoising`), with `decoder.anchors="spread"` only; None as in
             the paper.
-        axes: in which the host works. "ego": x forward, y left, as everywhere. "lidar": x to the right, y forward, as
-            the weights published for nuScenes need it (`models.lidar_axes`); the grid of `encoder` is then given in
+        axes: axes in which the host works. "ego": x forward, y left, as everywhere. "lidar": x to the right, y forward,
+            as the weights published for nuScenes need it (`models.lidar_axes`); the grid of `encoder` is then given in
             these axes, and all else, the predictions too, stays in the frame of the example.
         encoder, range, priors: see `HostConfig`. MapTR predicts no traffic elements.
     """

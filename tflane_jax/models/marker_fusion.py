@@ -45,7 +45,7 @@ class MarkerFusionConfig(TokenFusionConfig):
     `as_written` is Eq. (3) to the letter; `SMALL_MARKER_FUSION` trains on two CPU cores.
 
     Attributes:
-        prior: confidence and polylines.
+        prior: confidence of the markers, and polylines of their lanes.
         memory: temporal memory; None for the ablation without (Table III).
         encoding: of a polyline (Table IV): "sine" is the transformer on Eq. (1), "transformer" the same on raw
             coordinates, "mlp" a perceptron on each point's raw coordinates, whose outputs are joined as those of the

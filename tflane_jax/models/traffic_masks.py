@@ -31,7 +31,7 @@ class TrafficMaskConfig:
             the whole M_s, in place of the fusion modules.
         window: metres; lanes and instances further apart do not see each other. None: no limit.
         nearest: a lane sees only so many nearest instances. None: all.
-        head_windows: metres, one for each head, infinity allowed; () for none.
+        head_windows: window of each head, metres, infinity allowed; () for none.
         temporal: "all": a frame of a track attends to all valid frames, as in Fig. 4; "causal": to itself and earlier
             ones.
     """

@@ -51,7 +51,7 @@ class DropsConfig:
 
     Attributes:
         steps: numbers of updates after which the rate drops, ascending.
-        factor: on the rate at each drop.
+        factor: factor on the rate at each drop.
     """
 
     steps: Annotated[tuple[Count, ...], NOT_EMPTY, INCREASING] = (450_000,)
@@ -78,7 +78,7 @@ class OptimConfig:
         warmup_ratio: first learning rate relative to `lr`.
         final_ratio: learning rate, relative to `lr`, that the cosine reaches at the end of the run, after the last
             update; `restarts` have their own, `drops` have none.
-        weight_decay: on the parameters that `decayed` names.
+        weight_decay: weight decay of the parameters that `decayed` names.
         decayed: "kernels" and embeddings, or "all", biases and norms too, as the published camera hosts train.
         decay: "decoupled" from the gradient (AdamW), or "coupled": added to it, after clipping (PyTorch's Adam,
             except that a parameter whose gradient is zero everywhere in an update does not decay in it).
@@ -87,7 +87,7 @@ class OptimConfig:
             small models.
         muon_kernels: which kernels are Muon's; that of a convolution is a matrix of (kh kw cin) x cout.
         clip_norm: largest global gradient norm; inf for none.
-        b1, b2, eps: of Adam.
+        b1, b2, eps: Adam's parameters.
         ema_decay: of the averaged parameters that are evaluated; 0 evaluates the parameters themselves.
         epoch_steps: 0 lowers the learning rate with every step from the end of the warm-up to the end of the run.
             A positive number is the length of an epoch: as in mmcv's cosine annealing by epoch, the rate is constant

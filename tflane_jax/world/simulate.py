@@ -61,7 +61,7 @@ class WorldConfig:
     """The built-in world.
 
     Attributes:
-        roads, traffic, tracker: its parts.
+        roads, traffic, tracker: parts of the world: roads, traffic, and the tracker that observes it.
         markers: placement of fiducial markers. They change nothing else in a scene.
         severity: 0 (clear) to 1 (worst): scales weather and paint wear and, weakly, traffic density and tracker
             noise.

@@ -76,7 +76,7 @@ class CameraRigConfig:
 
     Attributes:
         cameras: the first one faces forward; traffic elements are labelled in its image.
-        scale: of the images, 1 is native.
+        scale: scale of the images; 1 is native.
         multiple: widths and heights are rounded up to multiples of this, which extends the view to the right and
             downwards.
         jitter: scales the deviation of a scene's calibration from the mounts (1: 0.35 degrees, 1 cm).

@@ -43,16 +43,16 @@ class HighwayConfig:
 
     Attributes:
         lanes: relative frequency of 2, 3, 4 and 5 lanes on the ego's carriageway.
-        lane_width: of all its lanes.
+        lane_width: width of all lanes of a road.
         between: probability that the ego drives on an inner lane where there is one.
         straight: probability of a straight road.
-        radius: of curves at the ego; their inverse is drawn uniformly.
+        radius: radius of curves at the ego; its inverse is drawn uniformly.
         curvature_change: largest change of the curvature within 100 m, 1/m.
         sway: standard deviation of the ego's distance from the middle of its lane.
         lane_change: probability that the ego's lateral position in its lane is uniform.
         two_way: probability of an undivided road with oncoming traffic beyond a double line.
         extra_lane: probability that a lane opens or closes on the right within sight.
-        inner_shoulder, outer_shoulder: beside the edge lines.
+        inner_shoulder, outer_shoulder: width of the shoulders beside the edge lines.
         opposite: distance between the edge lines of the two carriageways.
     """
 

@@ -49,7 +49,7 @@ class FrontWorldConfig:
     """Front views of the built-in world.
 
     Attributes:
-        camera, road, traffic, weather: its parts.
+        camera, road, traffic, weather: parts of the scene: camera, road, traffic, weather.
         severity: 0 (clear sky, fresh paint, clean asphalt, a perfect camera) to 1 (all degradations at full strength).
         reach: lane lines are annotated up to this distance along the road, metres.
     """

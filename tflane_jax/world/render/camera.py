@@ -27,13 +27,13 @@ class FrontCameraConfig:
     1280 x 720.
 
     Attributes:
-        width, height: of the image, pixels.
+        width, height: size of the image, pixels.
         focal: focal length at 1280 pixels of width; a guess, as are the 714 pixels that `datasets.photos` assumes for
             TuSimple's camera.
-        above_ground: metres.
+        above_ground: height above the ground, metres.
         pitch: how far the optical axis points below the horizon, degrees.
         yaw: largest deviation of the axis from the vehicle's heading, degrees.
-        roll: largest, degrees.
+        roll: largest rotation about the optical axis, degrees.
         centre: largest shift of the principal point at 1280 pixels of width, pixels.
     """
 

@@ -33,7 +33,7 @@ class FrontWeatherConfig:
     Attributes:
         kinds: relative frequencies at severity 1; at severity 0 all is clear, so that this kind is among them.
         fog: visibility in fog, metres (distance at which contrast has fallen to 1/e).
-        rain: the same in rain.
+        rain: visibility in rain, metres.
         noise: standard deviation of the sensor noise at severity 1, of full brightness 1; night doubles it.
         blur: largest blur of the lens, pixels.
         wear: largest wear of paint.

@@ -58,57 +58,58 @@ class RoadConfig:
             its roads, key frames may lie beyond it. Where `reach - ego_reach` is less than half the diagonal of the
             perceived box, or a frame lies beyond, the border of the map may cut lanes inside the box.
         vertex_spacing: largest distance between vertices of a line.
-        lane_width: vehicle lanes.
-        single_lane_width: the same on streets with at most one lane in each direction; None: no difference.
-        ring_lane_width: the lane of a roundabout.
-        bike_width: bike lanes.
-        parking_width: kerb-side parking strips.
-        gutter: between the outermost line and the kerb.
-        wide_median: raised medians from which a turning lane can be carved.
-        narrow_median: raised medians from which it cannot.
-        urban_speed, fast_speed, ramp_speed: speed limits.
-        comfortable_lateral_acceleration: m/s^2, limits the speed on connectors.
-        bend_radius: arcs of streets.
-        fast_bend_radius: arcs of roads with ramps and changing lane counts.
-        corner_radius: kerb roundings of intersections.
-        crossing_width: along the road.
+        lane_width: width of vehicle lanes.
+        single_lane_width: width of lanes on streets with at most one lane in each direction; None: no difference.
+        ring_lane_width: width of the lane of a roundabout.
+        bike_width: width of bike lanes.
+        parking_width: width of kerb-side parking strips.
+        gutter: distance between the outermost line and the kerb.
+        wide_median: width of raised medians from which a turning lane can be carved.
+        narrow_median: width of raised medians from which no turning lane can be carved.
+        urban_speed, fast_speed, ramp_speed: ranges of speed limits, m/s.
+        comfortable_lateral_acceleration: lateral acceleration, m/s^2, that limits the speed on connectors.
+        bend_radius: radius of the arcs of streets.
+        fast_bend_radius: radius of the arcs of roads with ramps and changing lane counts.
+        corner_radius: radius of the kerb roundings of intersections.
+        crossing_width: length of pedestrian crossings along the road.
         inner_marking, outer_marking: markings of the leftmost and the rightmost line of a direction of travel, with
             their relative frequencies over streets.
-        divider_marking: the same of the lines between lanes of one direction.
-        kerb_marking: instead of the first two, of lines with a kerb or a raised median beside them, not a bike lane, a
-            parking strip or oncoming traffic; None: no difference.
+        divider_marking: markings of the lines between lanes of one direction.
+        kerb_marking: instead of `inner_marking` and `outer_marking`, markings of lines with a kerb or a raised median
+            beside them, not a bike lane, a parking strip or oncoming traffic; None: no difference.
         solid_before_stop: length of the solid divider before a stop line, where dividers are painted.
         taper: length over which a lane opens or closes.
-        fast_taper: the same on fast roads.
+        fast_taper: length over which a lane opens or closes on fast roads.
         pocket: length of a turning lane, taper included.
         skew: largest deviation of the arms of an intersection from the right angle.
         arm_offset: largest sideways shift of an arm from the intersection's centre.
-        junction_distance: between the centres of two junctions.
+        junction_distance: distance between the centres of two junctions.
         side_lean: largest deviation of their side streets, and of those of staggered junctions, from the right angle;
             they also bend by less than this. Much of it lets streets on one side meet, if the junctions are near.
-        stagger: between the two side streets of a staggered junction, along its main road; a little more where the
-            lanes between them would be too short.
+        stagger: distance between the two side streets of a staggered junction, along its main road; a little more where
+            the lanes between them would be too short.
         junction_lanes: largest number of through lanes per direction of an intersection's main road, roundabouts and
             two junctions aside.
-        least_junction_lanes: smallest number of them; two junctions included.
+        least_junction_lanes: smallest number of through lanes per direction of an intersection's main road; two
+            junctions included.
         another_lane: probability for such a main road of one lane more in each direction, beyond `junction_lanes` too.
         second_sides: probability for each of two junctions to be a four-way intersection, not a T junction.
         wide_turns: probability for an intersection that a turn may end on every lane of the road that it enters; else
             each lane that turns leads to one lane.
         lane_changes: probability for each direction of a street from an intersection to the border of the map that a
             lane opens behind the intersection, or closes before it, where there is room.
-        change_distance: between the intersection and such a change, or between the turning lanes and it.
-        one_way, median, bike, parking: probability for a street.
-        mid_block_crossing: probability for a street without intersection.
-        signals: probability for an intersection.
-        crossings: probability for an arm of an intersection.
-        driveways: mean number on 100 m of kerb, where there is room for them.
-        driveway_width, driveway_depth: of a driveway; the depth is counted from the kerb.
+        change_distance: distance between the intersection and a change of lanes, or between the turning lanes and it.
+        one_way, median, bike, parking: probability that a street is one-way, has a median, bike lanes, parking strips.
+        mid_block_crossing: probability of a crossing on a street without intersection.
+        signals: probability that an intersection has traffic lights.
+        crossings: probability that an arm of an intersection has a crossing.
+        driveways: mean number of driveways on 100 m of kerb, where there is room for them.
+        driveway_width, driveway_depth: dimensions of a driveway; the depth is counted from the kerb.
         access_share: fraction of the driveways that are access roads, with a lane in and one out: the map cuts the
             lanes of the street there as at a junction, though its traffic passes. Drawn for each scene, uniform
             within min(access_share, 1 - access_share) of it.
-        access_width: of an access road.
-        access_rounding: radius of the kerbs at its corners.
+        access_width: width of an access road.
+        access_rounding: radius of the kerbs at the corners of an access road.
         cut_setback: how far from a stop line, or from the rounded corner of an access road, the map cuts lanes: each
             direction of a street draws from an exponential distribution, whose mean is drawn for each scene, uniform
             from 0 to twice this.

@@ -42,7 +42,7 @@ class SdMapConfig:
     Attributes:
         lines: capacity R; the nearest lines are kept.
         points: on each line, P, equally spaced (SMERF: 11).
-        range: where lines are cut, ego frame.
+        range: box at which lines are cut, ego frame.
         tolerance: largest distance of a dropped vertex from the simplified line, metres.
         survey: standard deviation of the error of the map's points along each axis, metres. It changes slowly from
             place to place, so roads that meet still meet.

@@ -34,12 +34,12 @@ class TrafficConfig:
     Attributes:
         vehicles_per_metre: mean density on a lane in free flow, up to what junctions let in: above about 0.05 it
             changes little; 0: no moving motor vehicles but the ego.
-        category_share: moving motor vehicles by category.
+        category_share: relative frequencies of the categories of moving motor vehicles.
         bicycles_per_metre: on bike lanes; slow outer lanes get half of the corresponding fraction of their traffic.
         parked_share: fraction of the parking slots that are occupied.
-        pedestrians_per_metre: on sidewalks.
+        pedestrians_per_metre: pedestrians on a metre of sidewalk.
         crossers_per_minute: crossing pedestrians, for each crossing.
-        ego_top_speed: m/s.
+        ego_top_speed: highest speed of the ego vehicle, m/s.
         ego_passes_s: time at which the ego vehicle passes the middle of its route, so the central feature of the roads,
             up to 20 m and what traffic allows, seconds after the first frame; None starts it anywhere on the route.
         variety: how much the amounts differ between scenes: moving vehicles, parked vehicles and pedestrians of a

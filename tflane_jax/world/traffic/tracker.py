@@ -32,15 +32,15 @@ class TrackerConfig:
         falloff: distance beyond `range` over which the probability falls to 0, metres.
         view_needed: visible fraction of a box from which detection is certain; 0 ignores occlusion.
         drop: probability of missing an actor in a frame.
-        position_noise: standard deviation per axis at distance 0, metres.
-        position_noise_growth: its growth with distance, metres per metre.
-        yaw_noise: standard deviation, radians.
-        size_noise: relative standard deviation, constant for a track.
+        position_noise: standard deviation of positions per axis at distance 0, metres.
+        position_noise_growth: growth of `position_noise` with distance, metres per metre.
+        yaw_noise: standard deviation of yaw, radians.
+        size_noise: relative standard deviation of sizes, constant for a track.
         velocity_noise: standard deviation per axis of a coasting track's velocity, m/s.
-        correlation: of the noise from frame to frame, 0 to 1.
+        correlation: correlation of the noise from frame to frame, 0 to 1.
         coast: frames for which a lost track is continued.
         switch_rate: identity switches per second between two neighbours nearer than `switch_distance`.
-        switch_distance: metres.
+        switch_distance: largest distance of neighbours that may switch identities, metres.
         look_every_s: interval at which line of sight is computed, seconds; it is interpolated in between.
     """
 

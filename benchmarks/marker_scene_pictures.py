@@ -20,7 +20,6 @@ from tflane_jax.plots.style import ROAD
 from tflane_jax.priors.marker_memory import MarkerGuidance
 from tflane_jax.scene import CameraViews, Example, Prediction
 from tflane_jax.scene.logs import KeyFrame
-from tflane_jax.tasks.lane_pictures import lanes_of
 from tflane_jax.tasks.marker_drive import DriveStep
 
 # Gaps in the picture, each of a scene of its own.
@@ -113,7 +112,7 @@ def save_gaps(path: Path, gaps: Sequence[Gap], source: ProceduralConfig) -> Path
         _draw_place(memory, gap)
         draw_ego(memory)
         for ax, name in zip(models, rows, strict=True):
-            draw_found(ax, gap.truth, lanes_of(gap.found[name]), ground=ground, view=view, title=name)
+            draw_found(ax, gap.truth, gap.found[name].lanes, ground=ground, view=view, title=name)
     label_edges(axes[:, 1:])
     figure.legend(handles=_entries(), loc="outside lower center", ncols=10, fontsize=8, frameon=False)
     return save_figure(figure, path)

@@ -51,7 +51,6 @@ from tflane_jax.progress import progress_bar
 from tflane_jax.runs import open_run
 from tflane_jax.scene import CameraViews
 from tflane_jax.scene.marker_patterns import MarkerFamily, marker_count
-from tflane_jax.tasks.lane_pictures import lanes_of
 from tflane_jax.tasks.marker_drive import DriveModel, DriveStep, MarkerDrive, as_trained, check_model, check_rate
 from tflane_jax.training.runtime import configure_jax
 
@@ -140,7 +139,7 @@ def _follow(
                 step.reading.observed.outcomes,
                 _confidence(step),
                 step.guidance,
-                None if step.prediction is None else lanes_of(step.prediction),
+                None if step.prediction is None else step.prediction.lanes,
                 view=view,
                 names=names,
                 title=frame_title(number, step.guidance, remembered=step.remembered),
@@ -290,7 +289,7 @@ def _record(step: DriveStep, views: CameraViews, names: Sequence[str], threshold
         "guidance": lanes,
     }
     if step.prediction is not None:
-        found = lanes_of(step.prediction)
+        found = step.prediction.lanes
         scores = 1.0 / (1.0 + np.exp(-np.asarray(found.logits, np.float64).max(-1)))
         best = [q for q in np.argsort(-scores, kind="stable") if scores[q] >= threshold]
         record["lanes"] = [

@@ -51,10 +51,10 @@ from tflane_jax.files.wording import counted
 from tflane_jax.plots import save_camera_views, save_examples
 from tflane_jax.plots.segments import true_lanes
 from tflane_jax.runs import Run
-from tflane_jax.scene import Example, LinePrediction, Prediction
+from tflane_jax.scene import Example, LanePrediction, LinePrediction, Prediction
 from tflane_jax.tasks import spread
 from tflane_jax.tasks.answers import answer_arrays
-from tflane_jax.tasks.lane_pictures import Found, lanes_of, titles
+from tflane_jax.tasks.lane_pictures import titles
 
 _RELATION_THRESHOLD = 0.5
 MOST_DRAWN = 16
@@ -86,7 +86,7 @@ def predict(trained: Run, options: argparse.Namespace) -> int:
 
     make_folder(options.out)
     write_npz(options.out / "predictions.npz", arrays)
-    truth = _truth(examples, lanes_of(answer), arrays)
+    truth = _truth(examples, answer.lanes, arrays)
     if truth is not None:
         write_npz(options.out / "truth.npz", truth | {name: arrays[name] for name in ("scene", "timestamp_ns")})
     head = {"run": trained.name, "step": trained.step, "seed": trained.config.training.seeds[0]}
@@ -104,7 +104,7 @@ def predict(trained: Run, options: argparse.Namespace) -> int:
 
 def _arrays(answer: Prediction, infos: Sequence[FrameInfo], topology: Topology = "learned") -> dict[str, np.ndarray]:
     """Return the arrays of predictions.npz; edges between lanes are those that `tflane eval` measures."""
-    arrays, lanes = answer_arrays(answer), lanes_of(answer)
+    arrays, lanes = answer_arrays(answer), answer.lanes
     if topology == "geometric" and not isinstance(lanes, LinePrediction) and lanes.successor_logits is not None:
         pairs = zip(lanes.points, lanes.successor_logits, strict=True)
         arrays["successor"] = np.stack([edge_confidences(*each, topology) for each in pairs])
@@ -126,7 +126,7 @@ def _draw(
     rows = spread(len(indices), MOST_DRAWN)
     drawn = [indices[row] for row in rows]
     examples, lanes, elements = jax.tree.map(
-        lambda leaf: np.asarray(leaf)[rows], (examples, lanes_of(answer), answer.elements)
+        lambda leaf: np.asarray(leaf)[rows], (examples, answer.lanes, answer.elements)
     )
     names = titles(dataset, drawn)
     look = {"ground": source.example.ground, "view": source.example.range, "threshold": options.threshold}
@@ -139,7 +139,7 @@ def _draw(
     return ["pictures.png", "cameras.png"]
 
 
-def _truth(examples: Example, lanes: Found, arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray] | None:
+def _truth(examples: Example, lanes: LanePrediction, arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray] | None:
     """Return the arrays of truth.npz but for the names of the frames; None for lines that are not labelled."""
     if isinstance(lanes, LinePrediction):
         true, kept = examples.map_lines, ["points", "category", "valid", "visibility", "dense"]

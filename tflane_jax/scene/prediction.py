@@ -9,6 +9,7 @@ import jax
 from flax import struct
 from jaxtyping import Float
 
+from tflane_jax.errors import UserError
 from tflane_jax.scene.arrays import Array
 
 
@@ -137,6 +138,9 @@ class CurvePrediction:
         return jax.nn.softmax(self.logits)[..., 1]
 
 
+LanePrediction = CenterlinePrediction | SegmentPrediction | LinePrediction
+
+
 @struct.dataclass
 class Prediction:
     """All predictions for one frame; no model predicts all parts.
@@ -154,3 +158,11 @@ class Prediction:
     lines: LinePrediction | None = None
     elements: ElementPrediction | None = None
     curves: CurvePrediction | None = None
+
+    @property
+    def lanes(self) -> LanePrediction:
+        """The predicted segments, centerlines or lines of a vector map; raises UserError where the model has none."""
+        for found in (self.segments, self.centerlines, self.lines):
+            if found is not None:
+                return found
+        raise UserError("this model predicts no lanes around the vehicle: choose a run of another model")

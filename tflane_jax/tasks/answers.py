@@ -10,7 +10,6 @@ import numpy as np
 from scipy.special import expit
 
 from tflane_jax.scene import LinePrediction, Prediction, SegmentPrediction
-from tflane_jax.tasks.lane_pictures import lanes_of
 
 
 def answer_arrays(prediction: Prediction) -> dict[str, Any]:
@@ -18,7 +17,7 @@ def answer_arrays(prediction: Prediction) -> dict[str, Any]:
 
     Arrays may have leading axes. `successor` holds the learned scores, zeros for a model without topology.
     """
-    lanes, elements = lanes_of(prediction), prediction.elements
+    lanes, elements = prediction.lanes, prediction.elements
     on_host = isinstance(lanes.logits, np.ndarray)
     sigmoid: Any = expit if on_host else jax.nn.sigmoid
     arrays: dict[str, Any] = {"points": lanes.points, "scores": sigmoid(lanes.logits).max(-1)}

@@ -28,21 +28,11 @@ from tflane_jax.evaluation.found_lanes import (
 from tflane_jax.evaluation.interventions import scene_numbers
 from tflane_jax.evaluation.lane_groups import lane_groups, line_groups
 from tflane_jax.evaluation.predict import FOR_PICTURES, predict_examples, predicted_batches
-from tflane_jax.scene import (
-    CenterlinePrediction,
-    Example,
-    LaneGraph,
-    LinePrediction,
-    MapLines,
-    Prediction,
-    SegmentPrediction,
-    stack_examples,
-)
+from tflane_jax.scene import Example, LaneGraph, LanePrediction, MapLines, Prediction, stack_examples
 from tflane_jax.tasks.base import Model, spread
 
 Group = Literal["hidden+traffic", "occluded"]
 Field = Literal["lanes", "segments", "map_lines"]
-Found = CenterlinePrediction | SegmentPrediction | LinePrediction
 _MEANING: dict[Group, str] = {
     "hidden+traffic": "that the sensor hardly shows and vehicles drove along",
     "occluded": "of which less than half is in line of sight",
@@ -62,7 +52,7 @@ def draw_examples(
     from tflane_jax.plots import save_camera_views, save_examples
 
     examples, answer = _predicted(model, dataset, indices)
-    found = lanes_of(answer)
+    found = answer.lanes
     path, names = folder / f"step_{step:08d}.png", titles(dataset, indices)
     ground, view = source.example.ground, source.example.range
     save_examples(path, examples, {f"step {step}": found}, titles=names, ground=ground, view=view)
@@ -92,7 +82,7 @@ def draw_hidden_lanes(
         hidden = (lanes.valid & _occluded(lanes)).sum(-1)
         indices = np.argsort(-hidden, kind="stable")[:_FRAMES_OF_ONE_MODEL].tolist()
     examples = stack_examples([dataset.example(index) for index in indices])
-    found = {name: lanes_of(_predicted(model, dataset, indices)[1]) for name, model in models.items()}
+    found = {name: _predicted(model, dataset, indices)[1].lanes for name, model in models.items()}
     ground, view = source.example.ground, source.example.range
     return save_examples(path, examples, found, titles=titles(dataset, indices), ground=ground, view=view)
 
@@ -109,7 +99,7 @@ class _Answers:
 
     found: Bool[np.ndarray, "f g"]
     threshold: float
-    lanes: Found
+    lanes: LanePrediction
 
 
 def draw_differences(
@@ -190,7 +180,7 @@ def _answers(model: Model, data: Example | Streamed, field: Field) -> _Answers:
     for indices, batch, answer in predicted_batches(
         model.task, model.params, data, model.batch_size, what=FOR_PICTURES
     ):
-        lanes.append(lanes_of(answer))
+        lanes.append(answer.lanes)
         scores.append(lane_scores(lanes[-1]))
         for row in range(len(indices)):
             truth, found = jax.tree.map(lambda leaf, i=row: np.asarray(leaf[i]), (getattr(batch, field), lanes[-1]))
@@ -225,16 +215,8 @@ def _occluded(lanes: LaneGraph | MapLines) -> Bool[np.ndarray, "*b n"]:
     return np.zeros(lanes.valid.shape, bool) if lanes.visibility is None else np.asarray(lanes.visibility) < 0.5
 
 
-def lanes_of(prediction: Prediction) -> Found:
-    """Return the predicted segments, centerlines or lines of a vector map; raise UserError for none of them."""
-    for found in (prediction.segments, prediction.centerlines, prediction.lines):
-        if found is not None:
-            return found
-    raise UserError("this host predicts no lanes, so there is nothing to draw")
-
-
 def truth_of(model: Model) -> Field:
-    """Return the field of `Example` that holds the truth of what `lanes_of` returns for this model."""
+    """Return the field of `Example` that holds the truth of what `Prediction.lanes` is for this model."""
     host: Any = getattr(model.task, "model", None)
     predicts = () if host is None else host.predicts
     if "lines" in predicts and "segments" not in predicts and "centerlines" not in predicts:

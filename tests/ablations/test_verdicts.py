@@ -6,9 +6,10 @@ from dataclasses import replace
 import pytest
 
 from tests.shared import ROOT
-from tflane_jax.ablations.declaration import Claim
-from tflane_jax.ablations.effects import Effect
-from tflane_jax.ablations.findings import sentence
+from tflane_jax.ablations.declaration import Claim, Declaration
+from tflane_jax.ablations.effects import Effect, judged_claims
+from tflane_jax.ablations.findings import findings, sentence
+from tflane_jax.ablations.results import Results
 from tflane_jax.ablations.verdicts import verdicts
 
 EFFECT = Effect(
@@ -80,6 +81,25 @@ def test_one_seed_has_no_p():
         None,
         None,
     )
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        "out of memory",
+        "XlaRuntimeError: INTERNAL (jit): device (0): lost",
+        "ValueError: expected ')': got '(': *x*",
+    ],
+)
+def test_the_reason_of_an_untested_claim_may_hold_brackets_and_colons(error):
+    """Regression: a reason with a bracket before a colon became part of the treatment."""
+    claim = Claim("A (1)", "B", "ours (by us): A is better than *B* (+7.7 DET_l)")
+    failed = Results(("A (1)", "B"), (0, 1), {}, failed={"A (1)": error})
+    (text,) = findings(judged_claims(failed, Declaration("all/DET_l", (claim,)), ""))
+    assert f"({error})" in text
+    row = only_row(text)
+    assert (row["treatment"], row["control"], row["verdict"]) == ("A (1)", "B", "not tested")
+    assert (row["difference"], row["p"], row["the paper"]) == (None, None, "+7.7 DET_l")
 
 
 def test_every_recorded_finding_is_in_the_table():

@@ -196,6 +196,30 @@ def test_clipping_keeps_a_line_inside_and_drops_touches():
         assert clip_to_range(np.zeros((size, 3)), RANGE) == []
 
 
+@pytest.mark.parametrize("top", [0.0, 3.0])
+def test_clipping_drops_lines_without_length_on_the_ground(top):
+    assert clip_to_range(np.array([[1.0, 2, 0], [1, 2, top]]), RANGE) == []
+
+
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        ([[-12, 0], [-10, 0], [0, 0]], [[[-10, 0], [0, 0]]]),
+        ([[-12, 0], [-10, 0], [12, 0]], [[[-10, 0], [10, 0]]]),
+        ([[0, 0], [10, 0], [12, 0]], [[[0, 0], [10, 0]]]),
+        ([[0, 0], [10, 0], [12, 0], [10, 0], [0, 0]], [[[0, 0], [10, 0]], [[10, 0], [0, 0]]]),
+        ([[0, 0], [10, 0], [0, 2]], [[[0, 0], [10, 0], [0, 2]]]),  # touches the border from inside: stays whole
+        ([[12, 3], [8, 7], [0, 0]], [[[5.714285714285714, 5], [0, 0]]]),  # touches the corner (10, 5) first
+    ],
+)
+def test_clipping_keeps_a_vertex_on_the_border_once(line, expected):
+    """Regression: the segment outside that ends there gave the vertex a second time."""
+    pieces = clip_to_range(np.array(line, float), RANGE)
+    assert len(pieces) == len(expected)
+    for piece, points in zip(pieces, expected, strict=True):
+        np.testing.assert_allclose(piece, points, rtol=1e-12)
+
+
 def test_clipping_beside_a_parallel_border_moves_no_point_sideways():
     # Half a metre from the border x = 10, cut at half of its length.
     (piece,) = clip_to_range(np.array([[9.5, -10, 0], [9.5, 0, 0]]), RANGE)

@@ -8,7 +8,8 @@ from typing import Any
 
 # "**shown**: A is better than *B* in all/recall, +0.52 points (95 % ..., p 0.0312, better in 4 of 5 seeds). Claim: ..."
 _FINDING = re.compile(
-    r"\*\*(?P<verdict>[a-z ]+)\*\*(?: \((?P<why>.*?)\))?: (?P<treatment>.+?) (?:is better than|minus) "
+    # The reason may quote an error with any brackets and colons: the last "): " before the treatment ends it.
+    r"\*\*(?P<verdict>[a-z ]+)\*\*(?: \((?P<why>.*)\))?: (?P<treatment>.+?) (?:is better than|minus) "
     r"\*(?P<row>.+?)\*(?: in (?P<measure>.+?), (?P<difference>[+-][\d.]+ \w+|no number))?(?P<rest>[;. ].*)?$"
 )
 _INTERVAL = re.compile(r"95 % ([+-][\d.]+ to [+-][\d.]+)")
@@ -26,10 +27,9 @@ def verdicts(found: Mapping[str, Mapping[str, Any]]) -> list[dict[str, str | Non
     rows: list[dict[str, str | None]] = []
     for name, summary in found.items():
         for finding in summary["findings"]:
-            if parts := _FINDING.match(finding):
-                rest = parts["rest"] or ""
-                primary, _, claim = rest.partition(". Claim: ")
-                primary = primary.split(";")[0]
+            effect, _, claim = finding.partition(". Claim: ")
+            if parts := _FINDING.match(effect):
+                primary = (parts["rest"] or "").split(";")[0]
                 interval, p, seeds = (pattern.search(primary) for pattern in (_INTERVAL, _P, _SEEDS))
                 rows.append(
                     {

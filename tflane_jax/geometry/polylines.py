@@ -227,7 +227,10 @@ def _has_length(points: np.ndarray) -> bool:
 
 
 def _cut(a: np.ndarray, b: np.ndarray, range_: PerceptionRange) -> tuple[np.ndarray, np.ndarray, bool, bool] | None:
-    """Return where a segment enters and leaves the box (Liang-Barsky), and whether at its ends; None if outside."""
+    """Return where a segment enters and leaves the box (Liang-Barsky), and whether at its ends.
+
+    None if it is outside or only touches the border: a vertex there belongs to the neighbour that goes inside.
+    """
     enter, leave = 0.0, 1.0
     # Plain floats: an array operation on one segment costs more than all of this.
     ends = list(zip((range_.x, range_.y), a[:2].tolist(), b[:2].tolist(), strict=True))
@@ -238,7 +241,7 @@ def _cut(a: np.ndarray, b: np.ndarray, range_: PerceptionRange) -> tuple[np.ndar
             continue
         t0, t1 = (low - start) / (stop - start), (high - start) / (stop - start)
         enter, leave = max(enter, min(t0, t1)), min(leave, max(t0, t1))
-    if enter > leave:
+    if enter >= leave:
         return None
     return _on_segment(a, b, enter, ends), _on_segment(a, b, leave, ends), enter == 0.0, leave == 1.0
 

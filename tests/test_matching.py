@@ -44,6 +44,13 @@ def test_padding_is_never_read(backend):
     np.testing.assert_array_equal(clean.matched, filled.matched)
 
 
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_costs_of_padding_leave_small_differences_of_others_alone(backend):
+    """One query, three targets and padding at the limit, next to which float32 holds no differences of hundredths."""
+    cost, valid = jnp.array([[0.03, 0.01, 0.02, 1e6]]), jnp.array([True, True, True, False])
+    assert match(cost, valid, backend).matched.tolist() == [False, True, False, False]
+
+
 @pytest.mark.parametrize(
     ("problems", "queries", "targets"), [(40, 12, 9), pytest.param(12, 48, 40, marks=pytest.mark.slow), (6, 5, 8)]
 )

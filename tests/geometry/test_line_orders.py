@@ -74,6 +74,13 @@ def test_the_start_of_a_ring_does_not_matter_and_its_direction_only_one_way(ways
     assert (of(line[::-1].copy()) == of(line)) == (ways == "both")
 
 
+@pytest.mark.parametrize("ways", ["one", "both"])
+def test_a_directed_ring_has_its_own_order_only(ways):
+    orders, there = point_orders(ring()[None], np.ones(1, bool), np.ones(1, bool), ways)
+    assert as_set(orders, there) == {ring().tobytes()}
+    assert there.sum() == 1
+
+
 @pytest.mark.parametrize("points", [2, 3, 20])
 def test_any_number_of_points_and_numpy_as_jax(points):
     lines = np.stack([ring(points, 1), np.random.default_rng(2).normal(size=(points, 2)).astype(np.float32)])

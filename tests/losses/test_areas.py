@@ -31,6 +31,13 @@ def make_prediction(seed=0):
     return AreaPrediction(jnp.asarray(points, jnp.float32), jnp.asarray(logits, jnp.float32))
 
 
+def perfect_prediction(areas, shift=0.0):
+    """Return two equal layers: the two areas, moved along x, two queries far away, and classes at 0.5."""
+    points = areas.points[:, :2].at[..., 0].add(shift)
+    points = jnp.concatenate([points, jnp.full((1, 2, POINTS, 3), 40.0)], 1)
+    return AreaPrediction(jnp.stack([points, points], 1), jnp.zeros((1, 2, 4, 2)))
+
+
 def loss(areas, prediction=None, **settings):
     run = jax.jit(lambda p, a: area_loss(p, a, AreaLossConfig(**settings), "jax"))
     return run(make_prediction() if prediction is None else prediction, areas)
@@ -75,9 +82,7 @@ def test_order_of_queries_and_areas_is_free():
 def test_terms_by_hand():
     """Perfect points and directions; classes at 0.5: 2 layers, 2 matched of 4 queries with 2 classes."""
     areas = make_areas()
-    points = jnp.concatenate([areas.points[:, :2], jnp.full((1, 2, POINTS, 3), 40.0)], 1)
-    perfect = AreaPrediction(jnp.stack([points, points], 1), jnp.zeros((1, 2, 4, 2)))
-    value, report = loss(areas, perfect)
+    value, report = loss(areas, perfect_prediction(areas))
     assert float(report["area_points"]) == 0.0
     # Steps of no length, and none of these lines has one, would count 1.
     np.testing.assert_allclose(report["area_direction"], 0.0, atol=1e-6)
@@ -85,9 +90,36 @@ def test_terms_by_hand():
     classes = 1.5 * (2 * 0.25 * each + 6 * 0.75 * each) / 2
     np.testing.assert_allclose(report["area_class"], classes, rtol=1e-5)
     np.testing.assert_allclose(value, 2 * classes, rtol=1e-5)
-    shifted = perfect.replace(points=perfect.points.at[..., 0].add(1.0))
     # Six points, each 1 m off; the L1 of the published loss is in metres.
+    shifted = perfect_prediction(areas, 1.0)
     np.testing.assert_allclose(loss(areas, shifted)[1]["area_points"], 0.025 * 6.0, rtol=1e-4)
+
+
+def test_the_class_may_be_the_quality_of_the_points():
+    """Points 1 m off have a quality of 1 / (1 + 1), which matched queries predict: only the six other classes count."""
+    areas = make_areas()
+    _, report = loss(areas, perfect_prediction(areas, 1.0), class_target="quality")
+    np.testing.assert_allclose(report["area_class"], 1.5 * 6 * 0.25 * np.log(2) / 2, rtol=1e-4)
+
+
+def test_short_steps_count_less_in_directions():
+    """True steps have a cosine of L^2 / (L^2 + least^2) with themselves."""
+    areas = make_areas()
+    squared = (np.diff(np.asarray(areas.points[0, :2], float), axis=1) ** 2).sum(-1)
+    _, report = loss(areas, perfect_prediction(areas), least_step=3.0)
+    expected = 0.005 * (1.0 - squared / (squared + 9.0)).sum() / 2
+    np.testing.assert_allclose(report["area_direction"], expected, rtol=1e-4)
+
+
+@pytest.mark.parametrize("rings", ["one", "both"])
+def test_a_ring_may_turn_either_way_only_where_the_setting_says_so(rings):
+    areas = make_areas()
+    turned = areas.replace(points=areas.points.at[0, 0].set(areas.points[0, 0, ::-1]))
+    _, report = loss(turned, perfect_prediction(areas), rings=rings)
+    assert (float(report["area_points"]) < 1e-6) == (rings == "both")
+    assert area_targets(jax.tree.map(lambda leaf: leaf[0], areas), rings).order_valid.sum(-1).tolist() == (
+        [10, 2, 10] if rings == "both" else [5, 2, 5]
+    )
 
 
 def test_classes_are_those_of_areas():

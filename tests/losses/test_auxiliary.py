@@ -1,10 +1,14 @@
-"""Losses of denoised lanes: every copy is compared with the ground truth of its own example."""
+"""Losses of denoised lanes, of which every copy is compared with its own example, and of lane proposals in a batch."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
-from tflane_jax.losses.auxiliary import denoising_pairs
-from tflane_jax.scene import CenterlinePrediction
+from tflane_jax.geometry import PerceptionRange
+from tflane_jax.losses.auxiliary import auxiliary_losses, denoising_pairs
+from tflane_jax.models.auxiliary import AuxiliaryOutputs, LaneProposalOutputs
+from tflane_jax.scene import CenterlinePrediction, LaneGraph
 
 
 def test_every_copy_has_the_truth_of_its_own_example_and_every_query_its_own_lane():
@@ -20,3 +24,26 @@ def test_every_copy_has_the_truth_of_its_own_example_and_every_query_its_own_lan
     for row, of in enumerate(truth["example"].tolist()):
         assert assignment.matched[row, 0].tolist() == [True, of == 0, False, False]
         assert assignment.query[row, 0].tolist() == [0, int(of == 0), 0, 0]
+
+
+def test_proposal_losses_of_equal_examples_do_not_depend_on_their_number():
+    rng = np.random.default_rng(0)
+    lanes = LaneGraph.empty(2, 5)
+    lanes.points[0], lanes.valid[0] = rng.normal(size=(5, 3)), True
+    heat, shapes = (jnp.asarray(rng.normal(size=size)) for size in ((4, 6, 8), (2, 5, 3)))
+    outputs = LaneProposalOutputs(heat=heat, lanes=shapes)
+
+    def report(copies):
+        truth, proposals = jax.tree.map(lambda leaf: jnp.stack([jnp.asarray(leaf)] * copies), (lanes, outputs))
+        terms = auxiliary_losses(
+            AuxiliaryOutputs(lane_proposals=proposals),
+            ("lane_proposals",),
+            truth,
+            bev_range=PerceptionRange(),
+            cell_weight=1.0,
+            proposal_weights=(1.5, 0.5),
+            denoising=lambda *_: {},
+        )[1]
+        return {name: float(value) for name, value in terms.items()}
+
+    assert report(2) == pytest.approx(report(1), rel=1e-5)

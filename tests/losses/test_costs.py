@@ -146,3 +146,9 @@ def test_quality_focal_loss_has_a_finite_gradient_at_saturated_logits_and_at_its
     assert np.isfinite(found).all()
     if gamma == 0.0:  # plain cross-entropy
         np.testing.assert_allclose(found, p - np.asarray(target), atol=1e-6)
+
+
+@pytest.mark.parametrize(("other", "expected"), [((0.0, 0.0), 0.0), ((2.0, 1.0), -1.0)])
+def test_boxes_without_area_do_not_overlap(other, expected):
+    here, there = jnp.zeros((2, 2)), jnp.broadcast_to(jnp.array(other), (2, 2))
+    np.testing.assert_allclose(generalised_iou(here, there), expected, atol=1e-5)

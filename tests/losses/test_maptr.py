@@ -261,8 +261,8 @@ def test_the_nearest_order_is_so_in_fractions_of_the_range():
 def test_quality_falls_with_the_mean_distance_of_the_nearest_order():
     truth = np.zeros((2, 4, 2), np.float32)
     moved = truth.copy()
-    moved[1, :2] = [1.2, 1.6]  # half of the points by 2 m
-    np.testing.assert_allclose(line_quality(jnp.asarray(moved), jnp.asarray(truth)), [1.0, 0.5], rtol=1e-6)
+    moved[1, :2] = [2.4, 3.2]  # half of the points by 4 m
+    np.testing.assert_allclose(line_quality(jnp.asarray(moved), jnp.asarray(truth)), [1.0, 0.2], rtol=1e-6)
     orders = jnp.stack([jnp.asarray(truth) + 9.0, jnp.asarray(moved)], 1)
     targets = LineTargets(orders, jnp.array([[True, True], [True, False]]), jnp.zeros(2, jnp.int32), jnp.ones(2, bool))
     chosen = nearest_order(jnp.asarray(moved), targets, RANGE)

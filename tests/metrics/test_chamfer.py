@@ -53,6 +53,11 @@ def test_a_closing_vertex_counts_once():
     np.testing.assert_allclose(pair_chamfer(lines, point, np.array([0, 1]), np.array([0, 0])), expected)
 
 
+def test_a_line_that_ends_above_its_start_is_not_closed():
+    ramp = np.array([[0, 0, 0], [4, 0, 1], [4, 4, 2], [0, 0, 3]], float)
+    assert PaddedLines.of([ramp], "ramp").open_ends().counts.tolist() == [4]
+
+
 def test_a_line_of_one_vertex_is_not_closed():
     points = PaddedLines.of([np.zeros((1, 3)), np.array([[3.0, 4.0, 0.0]])], "points").open_ends()
     np.testing.assert_array_equal(pair_chamfer(points, points, np.array([0]), np.array([1])), [5.0])

@@ -98,6 +98,8 @@ def score(true, found):
         ([along((-60, 0))], [along((0, -60))], (0, 0, 0)),  # ends behind -50 m: not counted
         ([along((40, 60))], [along((60, 40))], (0, 0, 0)),  # starts ahead of 49 m
         ([along((40, 60))], [along((40, 60))], (1, 1, 1)),
+        ([along((49, 40))], [along((49, 40))], (0, 0, 0)),  # the borders themselves are left out
+        ([along((-40, -50))], [along((-40, -50))], (0, 0, 0)),
         # The nearest pair is 0.3 m apart, yet the pairing of least cost leaves it: 0.7 + 1.2 against 0.3 + 2.2.
         ([along((0, 19)), along((0, 19), 1.0)], [along((0, 19), 0.7), along((0, 19), 2.2)], (1, 1, 1)),
         ([], [along((0, 19))], (0, 0, 0)),
@@ -107,6 +109,13 @@ def score(true, found):
 )
 def test_by_hand(true, found, expected):
     assert score(true, found) == pytest.approx(expected)
+
+
+def test_only_an_exact_pair_costs_nothing():
+    """Lanes a and b on two planes, detections a and c: (a-a, b-c) costs 0 + 1, and (a-c, b-a) 1 + 1, not 0 + 0."""
+    a, b, c = (np.array([(0, y, 0), (1, 0, 0)], float) for y in (0.0, -0.8, 0.8))
+    # b and c are 1.6 m apart on one plane of two, which is not near.
+    assert score([a, b], [a, c]) == (0.5, 0.5, 0.5)
 
 
 def test_vertices_of_one_x():

@@ -12,7 +12,14 @@ from tests.metrics.segments import evaluate, frame, random_segments, segment, wi
 from tflane_jax.errors import UserError
 from tflane_jax.metrics.centerline_matching import LANE_THRESHOLDS, match_lanes
 from tflane_jax.metrics.chamfer import PaddedLines, pair_chamfer
-from tflane_jax.metrics.segment_matching import match_segments, nearest_segments
+from tflane_jax.metrics.segment_matching import (
+    CROSSING,
+    AreaDetections,
+    AreaTruth,
+    match_areas,
+    match_segments,
+    nearest_segments,
+)
 
 CASES = list(expected_cases("lanesegment"))
 
@@ -77,6 +84,18 @@ def test_a_shift_counts_one_and_a_half_times():
     assert [second[f"DET_l@{t}"] for t in LANE_THRESHOLDS] == pytest.approx([0.5, 1.0, 1.0])
 
 
+def test_far_segments_are_nearest_by_the_relaxed_distance():
+    """All in between are 3 m or more away: 28 m x 0.9 to the lane at 20 m, and 32 m x 0.6 to that at 80 m."""
+    detections, truth = frame([20.0, 80.0], [48.0], [0.9])
+    distance, nearest = nearest_segments(
+        [truth.lanes.points, truth.left, truth.right],
+        [detections.lanes.points, detections.left, detections.right],
+        nearest="all",
+    )
+    assert distance.tolist() == [np.inf]
+    assert nearest.tolist() == [1]
+
+
 def test_side_lines_cannot_bring_back_a_far_centerline():
     detections, truth = frame([0.0], [0.0], [0.9])
     moved = dataclasses.replace(detections, lanes=dataclasses.replace(detections.lanes, points=[segment(3.0)[0]]))
@@ -91,6 +110,32 @@ def chamfer_by_loops(a, b):
     a = a[:-1] if len(a) > 1 and (a[0] == a[-1]).all() else a
     distance = np.array([[np.linalg.norm(u - v) for v in b] for u in a])
     return 0.5 * (distance.min(0).mean() + distance.min(1).mean())
+
+
+def ring_and_moved_corner(x, shift):
+    """Return a closed ring of 4 m x 2 m that begins at `x`, and its four corners with the first one moved along x."""
+    ring = np.array([(x, 0, 0), (x + 4, 0, 0), (x + 4, 2, 0), (x, 2, 0), (x, 0, 0)], float)
+    corners = ring[:-1].copy()
+    corners[0, 0] += shift
+    return ring, corners
+
+
+def test_the_closing_vertex_of_a_true_area_does_not_count():
+    """One corner of four is 1.8 m off: 0.45 m, a hit at each threshold; counted twice, it would be 0.585 m."""
+    ring, corners = ring_and_moved_corner(0.0, -1.8)
+    assert chamfer_by_loops(ring, corners) == pytest.approx(0.45)
+    detected = AreaDetections([corners], np.array([CROSSING]), np.array([0.9]))
+    matched = match_areas(detected, AreaTruth([ring], np.array([CROSSING])))
+    assert matched.hits.tolist() == [[True], [True], [True]]
+
+
+def test_the_closing_vertex_of_a_true_side_line_does_not_count_in_the_error():
+    """As of areas: one corner of four is 1.2 m off, on one of three lines."""
+    ring, corners = ring_and_moved_corner(10.0, -1.2)
+    detections, truth = frame([0.0], [0.0], [0.9])
+    sides = dataclasses.replace(detections, left=[corners]), dataclasses.replace(truth, left=[ring])
+    assert chamfer_by_loops(ring, corners) == pytest.approx(0.3)
+    assert evaluate([sides], "LaneSegNet")["AE_dist"] == pytest.approx(0.3 / 3)
 
 
 @pytest.mark.golden

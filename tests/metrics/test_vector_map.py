@@ -124,6 +124,14 @@ def test_by_hand():
     assert (result["frames"], result["lines"]) == (1, 1)
 
 
+@pytest.mark.parametrize(("measure", "expected"), [("chamfer", 5 / 6), ("iou", 11 / 20)])
+def test_recall_is_the_mean_over_the_thresholds_of_the_measure(measure, expected):
+    """One of two lines is 0.6 m off: found at 1 and 1.5 m; its 2 m wide buffer has an IoU of 1.4 / 2.6, above 0.5."""
+    metrics = VectorMapMetrics(measure=measure)
+    metrics.update(*frame([line(0), line(9)], [line(0), line(9.6)], [0.9, 0.8]))
+    assert metrics.compute()["recall"] == pytest.approx(expected)
+
+
 def test_a_class_that_a_part_lacks_does_not_count_there():
     """All lines are found and none is a crossing, which counts 0 in the whole, as officially, and in no part of it."""
     metrics = GroupedMetrics(
@@ -154,6 +162,25 @@ def test_a_class_that_a_part_lacks_does_not_count_there():
         assert {name for name in result[part] if "AP" in name and "@" not in name} == samples[part].keys() == names
         assert {name.split("@")[0] for name in result[part] if "AP" in name} == names
         assert all(result[part][name] == 1.0 for name in names)
+
+
+def test_a_detection_of_a_class_that_its_frame_lacks_counts_in_the_whole_alone():
+    """The first frame has no boundary: what is found there belongs to no line, so to no part."""
+    metrics = GroupedMetrics(VectorMapMetrics)
+    for true, found, scores in (([0], [0, 2], [0.9, 0.9]), ([2], [2], [0.8])):
+        detections, truth = frame([line(0)], [line(0)] * len(found), scores, (true, found))
+        metrics.update(detections, dataclasses.replace(truth, visibility=np.ones(1)))
+    result = metrics.compute()
+    assert (result["all"]["AP_boundary"], result["clear"]["AP_boundary"]) == (0.5, 1.0)
+    matched = match_map(*frame([line(0)], [line(0), line(1)], [0.9, 0.8], ([0], [0, 2])), nearest="all")
+    assert matched.select(np.ones(1, bool)).classes.tolist() == [0]
+
+
+@pytest.mark.parametrize("measure", ["chamfer", "iou"])
+def test_a_detection_far_from_all_lines_has_a_nearest_one(measure):
+    """Without overlap, the IoU of all lines is equal."""
+    far = frame([line(0), line(40)], [line(50)], [0.9])
+    assert match_map(*far, measure=measure, nearest="all").nearest.tolist() == [1]
 
 
 def test_the_group_of_a_detection_depends_on_no_other_line():

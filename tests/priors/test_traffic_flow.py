@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import math
 
 import jax
 import jax.numpy as jnp
@@ -37,6 +38,15 @@ def make_flow(seed: int = 0, instances: int = 12, frames: int = 20, capacity: in
     )
 
 
+def weight_at(x: float, y: float, config: TrafficFlowPriorConfig) -> float:
+    """Return the weight of one place by its formula: x ahead, metres."""
+    beyond = abs(math.degrees(math.atan2(y, x))) - config.front_sector_deg / 2
+    if beyond <= 0:
+        return 1.0
+    turned = beyond / (180 - config.front_sector_deg / 2)
+    return (1 - 0.5 * turned) / (1 + math.hypot(x, y) / config.distance_scale)
+
+
 def loop_selection(flow: TrafficFlow, config: TrafficFlowPriorConfig) -> list[int]:
     """Return the selected instances by plain loops, after the paper's description."""
     ranked = []
@@ -52,8 +62,7 @@ def loop_selection(flow: TrafficFlow, config: TrafficFlowPriorConfig) -> list[in
         if len(frames) < config.min_valid_frames:
             continue
         x, y = flow.position[k, frames[-1], :2]
-        weight = float(ego_centric_weight(np.array([[x, y]]), config)[0])
-        ranked.append((-weight, float(np.hypot(x, y)), k))
+        ranked.append((-weight_at(x, y, config), float(np.hypot(x, y)), k))
     return [k for *_, k in sorted(ranked)][: config.max_instances]
 
 
@@ -66,6 +75,23 @@ def test_selection_matches_plain_loops(seed, tolerance):
     expected = loop_selection(flow, config)
     assert tokens.index[tokens.valid].tolist() == expected
     assert tokens.valid.tolist() == [i < len(expected) for i in range(6)]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_every_instance_keeps_its_own_size_category_heading_and_weight(seed):
+    flow = make_flow(seed)
+    tokens = select_traffic_flow(flow, dataclasses.replace(CONFIG, coordinates="metres"))
+    assert tokens.valid.any()
+    for slot in np.flatnonzero(tokens.valid):
+        k, there = tokens.index[slot], tokens.frame_valid[slot]
+        np.testing.assert_array_equal(tokens.size[slot], flow.size[k])
+        assert tokens.category[slot] == flow.category[k]
+        np.testing.assert_array_equal(tokens.position[slot][there], flow.position[k][there])
+        yaw = flow.yaw[k][there]
+        np.testing.assert_allclose(tokens.heading[slot][there], np.stack([np.cos(yaw), np.sin(yaw)], -1), atol=1e-6)
+        np.testing.assert_array_equal(tokens.heading[slot][~there], 0.0)
+        x, y = flow.position[k, np.flatnonzero(there)[-1], :2]
+        assert tokens.weight[slot] == pytest.approx(weight_at(x, y, CONFIG), rel=1e-5)
 
 
 @pytest.mark.parametrize("coordinates", ["normalised", "metres"])
@@ -141,6 +167,23 @@ def test_weights(distance, bearing, farther):
     elif abs(bearing) > np.pi / 6 + 1e-6:
         assert here < 1
         assert weight(distance + farther, bearing) < here
+
+
+@pytest.mark.parametrize(
+    ("x", "y", "scale", "expected"),
+    [
+        (9.0, 5.0, 10.0, 1.0),  # 29 degrees
+        (0.0, 10.0, 10.0, 0.8 / 2),  # 60 of the 150 degrees outside the sector: 1 - 0.5 * 0.4
+        (0.0, -30.0, 10.0, 0.8 / 4),
+        (-1e-9, 0.0, 10.0, 0.5),
+        (-25.0, 0.0, 25.0, 0.5 / 2),
+    ],
+)
+def test_weights_by_hand(x, y, scale, expected):
+    """Half as much behind as ahead, and halved at `distance_scale`; `forward` names the axis that points ahead."""
+    config = TrafficFlowPriorConfig(distance_scale=scale)
+    np.testing.assert_allclose(ego_centric_weight(np.array([[x, y]]), config), expected, rtol=1e-6)
+    np.testing.assert_allclose(ego_centric_weight(np.array([[-y, x]]), config, "y"), expected, rtol=1e-6)
 
 
 @settings(max_examples=20)

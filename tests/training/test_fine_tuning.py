@@ -3,6 +3,7 @@
 import dataclasses
 import shutil
 
+import jax
 import numpy as np
 import pytest
 
@@ -56,6 +57,15 @@ def test_every_seed_may_start_from_a_run_of_its_own(whole, tmp_path):
         host = Checkpoints(tmp_path / f"host_{i}" / "checkpoints").params(4)["line"]["kernel"]
         np.testing.assert_allclose(tuned[i], host, rtol=1e-6)
     assert not np.array_equal(tuned[0], tuned[1])
+
+
+def test_seeds_that_start_from_one_run_keep_random_keys_of_their_own(whole, tmp_path):
+    """Else they would draw the same dropout, and several seeds would be one."""
+    seeds = (0, 5)
+    run(tmp_path / "run", config=dataclasses.replace(CONFIG, steps=1, seeds=seeds, init_from=str(whole)), optim=STILL)
+    keys = Checkpoints(tmp_path / "run" / "checkpoints").arrays(1)["key"]
+    expected = [np.asarray(jax.random.key_data(jax.random.key(seed))) for seed in seeds]
+    np.testing.assert_array_equal(keys, expected)
 
 
 def test_a_seed_starts_from_itself_where_a_run_has_several(tmp_path):

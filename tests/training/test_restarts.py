@@ -22,6 +22,7 @@ from tflane_jax.training.restarts import (
     first_cycle,
     half_cosine,
     relative_rate,
+    restarted_cycle,
     with_cycle,
 )
 from tflane_jax.training.schedule import OptimConfig, make_optimizer, make_rate, make_schedule
@@ -208,6 +209,15 @@ def test_an_extended_cycle_leaves_the_next_one_at_least_half_or_nothing():
         longer = extended_cycle(config, cycle, 0.5, steps)
         assert longer.start + longer.length == end, steps
         assert longer.count == 80
+
+
+@pytest.mark.parametrize(("count", "length"), [(14, 16), (12, 18), (10, 10), (25, 5)])
+def test_a_restarted_cycle_of_a_fitted_run_leaves_no_short_rest(count, length):
+    """Cycles of 10 steps, 30 in all: what does not fill another cycle after this one belongs to it."""
+    config = RestartsConfig(10, 1.0, last_cycle="fit")
+    stuck = jax.device_get(first_cycle(config, 0, 30))._replace(start=np.int32(10), count=np.int32(count))
+    cycle = restarted_cycle(config, stuck, 0.5, 30)
+    assert (cycle.start, cycle.length, cycle.period, cycle.magnitude) == (count, length, 10, 0.5)
 
 
 def test_cycles_are_recorded():

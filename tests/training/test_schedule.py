@@ -104,6 +104,15 @@ def test_first_update_is_adamw_with_clipping():
     np.testing.assert_allclose(updates["bias"], [0.0, -0.1], rtol=1e-4)
 
 
+def test_coupled_decay_is_added_to_the_clipped_gradient():
+    # With a huge epsilon, and as huge a learning rate, Adam's first update is the gradient itself.
+    config = OptimConfig(lr=1e8, eps=1e8, warmup_steps=0, final_ratio=1.0, weight_decay=0.5, decay="coupled")
+    optimizer = make_optimizer(replace(config, clip_norm=1.0), LONG)
+    grads, params = {"kernel": jnp.array([[30.0, 40.0]])}, {"kernel": jnp.full((1, 2), 2.0)}
+    (updates,) = updates_of(optimizer, grads, params)
+    np.testing.assert_allclose(updates["kernel"], [[-(0.6 + 1.0), -(0.8 + 1.0)]], rtol=1e-5)
+
+
 def test_parameters_without_gradients_do_not_decay():
     params = {"frozen": {"kernel": jnp.ones((2, 2))}, "learned": {"kernel": jnp.ones((2, 2))}}
     grads = {"frozen": {"kernel": jnp.zeros((2, 2))}, "learned": {"kernel": jnp.array([[1.0, 0.0], [0.0, 0.0]])}}

@@ -46,6 +46,17 @@ def _without_norm(encoder, params, bev):
         return encoder.apply(params, bev)
 
 
+def test_a_feature_cell_reads_the_raster_around_its_own_block():
+    """Two convolutions of 3 x 3 features, of 4 x 4 raster cells each, see two blocks to every side."""
+    config = EvidenceEncoderConfig(dim=8, dilations=(1,))
+    bev = jax.random.randint(jax.random.key(1), (24, 40, 4), 0, 255).astype(jnp.uint8)
+    _, params, encoder = features(config, bev)
+    slope = jax.jacrev(lambda x: _without_norm(encoder, params, x)[2, 6].sum())(bev.astype(jnp.float32))
+    rows, columns = np.mgrid[:24, :40] // 4
+    expected = (abs(rows - 2) <= 2) & (abs(columns - 6) <= 2)
+    np.testing.assert_array_equal(np.asarray(slope != 0).any(-1), expected)
+
+
 def test_priors_are_fused_before_the_levels_and_after_every_block():
     layers = []
 

@@ -15,11 +15,12 @@ from tests.parameters import random_params
 from tests.shared import random_array
 from tests.slow import with_slow
 from tflane_jax.errors import UserError
-from tflane_jax.layers.attention import MultiHeadAttention
 from tflane_jax.layers.image_graph import SIDES
 from tflane_jax.layers.masks import key_mask
+from tflane_jax.layers.transformer import EncoderLayer, TransformerConfig
 from tflane_jax.models.graph_encoders import (
     GcnEncoderConfig,
+    GraphEncoderLayer,
     GtnEncoderConfig,
     HanEncoderConfig,
     HeterogeneousAttention,
@@ -114,18 +115,24 @@ def test_gtn_equals_dense_meta_path_products(similarity):
 
 
 @pytest.mark.parametrize("heads", [1, 2])
-def test_a_gtn_that_selects_similarity_is_the_transformers_attention(heads):
+def test_a_gtn_that_selects_similarity_is_the_transformers_layer(heads):
     config = dataclasses.replace(GTN, heads=heads, head_dim=DIM // heads)
     x, position, valid = scene()
     x, position = jnp.where(valid[..., None], x, 0.0), jnp.where(valid[..., None], position, 0.0)
-    module = MetaPathConvolution(config)
+    module = GraphEncoderLayer(config)
     params = random_params(module.init, x, position, valid)["params"]
-    selection = jnp.full_like(params["selection"], -1e9).at[0, :, 0].set(0.0).at[1, :, -1].set(0.0)
-    out = jax.jit(module.apply)({"params": params | {"selection": selection}}, x, position, valid)
-    attention = MultiHeadAttention(DIM, heads)
-    shared = {name: params[name] for name in ("query", "key", "value", "output")}
-    asking, mask = (x + position).reshape(-1, DIM), key_mask(valid.reshape(-1))
-    expected = attention.apply({"params": shared}, asking, asking, x.reshape(-1, DIM), mask).reshape(x.shape)
+    selection = params["graph"].pop("selection")
+    shared = {
+        "self_attention": params["graph"],
+        "attended": {"norm": params["graph_norm"]},
+        "feed_forward": {name: params[name] for name in ("expand", "contract")},
+        "fed": {"norm": params["fed_norm"]},
+    }
+    layer, mask = EncoderLayer(TransformerConfig(heads, config.hidden)), key_mask(valid.reshape(-1))
+    expected = layer.apply({"params": shared}, x.reshape(-1, DIM), position.reshape(-1, DIM), mask).reshape(x.shape)
+    similar = jnp.full_like(selection, -1e9).at[0, :, 0].set(0.0).at[1, :, -1].set(0.0)
+    params = params | {"graph": params["graph"] | {"selection": similar}}
+    out = jax.jit(module.apply)({"params": params}, x, position, valid)
     np.testing.assert_allclose(out[valid], expected[valid], rtol=1e-4, atol=1e-5)
 
 
@@ -162,8 +169,8 @@ def test_a_composed_meta_path_is_the_product_of_its_edges(scores):
     out, state = jax.jit(partial(module.apply, mutable="intermediates"))({"params": params}, x, position, valid)
     value = np.asarray(x @ params["value"]["kernel"] + params["value"]["bias"][None, None]).reshape(-1, 2, DIM // 2)
     shown, (fractions,) = np.asarray(valid).reshape(-1), state["intermediates"]["relations"]
-    expected = 0.0
-    for fraction, relation in zip(np.asarray(fractions)[0, 0], relations, strict=True):
+    by_path = []
+    for relation in relations:
         path = relation.split("+")
         weights = [np.asarray(edge) for edge in state["intermediates"][f"{relation}_probabilities"]]
         dense = [dense_edge(edge, weight, 2) for edge, weight in zip(path, weights, strict=True)]
@@ -173,7 +180,12 @@ def test_a_composed_meta_path_is_the_product_of_its_edges(scores):
         product = dense[1] @ (dense[0] * shown[None, :, None])
         np.testing.assert_allclose(product.sum(-1)[:, shown], 1.0, rtol=1e-5)
         heard = np.einsum("hnm,mhd->nhd", product, value).reshape(-1, DIM)
-        expected = expected + fraction * np.asarray(jax.nn.elu(heard))
+        by_path.append(np.asarray(jax.nn.elu(heard)))
+    # Eq. (7) to (9): softmax of the mean over valid cells of q^T tanh(W z + b).
+    summaries = [np.tanh(z @ params["semantic"]["kernel"] + params["semantic"]["bias"][None]) for z in by_path]
+    asked = np.exp([(each @ params["question"]["kernel"])[shown].mean() for each in summaries])
+    np.testing.assert_allclose(fractions[0, 0], asked / asked.sum(), rtol=1e-5)
+    expected = np.einsum("r,rnd->nd", asked / asked.sum(), by_path)
     np.testing.assert_allclose(np.asarray(out).reshape(-1, DIM)[shown], expected[shown], rtol=1e-4, atol=1e-5)
 
 
@@ -193,9 +205,10 @@ def test_padding_changes_nothing(name):
     fill = lambda value: [jnp.where(valid[..., None], x, value) for x in (features, position)]  # noqa: E731
     clean, dirty = run(*fill(0.0), valid), run(*fill(jnp.nan), valid)
     jax.tree.map(np.testing.assert_array_equal, clean, dirty)
-    out, _, (by_param, by_feature, _) = dirty
+    out, _, (by_param, by_feature, by_position) = dirty
     np.testing.assert_array_equal(out[~valid], 0.0)
     assert float(jnp.abs(by_feature[valid]).min()) > 0
+    assert bool(by_position[valid].any()) == (name not in ("gcn", "gtn structural"))  # the two without queries
     np.testing.assert_array_equal(by_feature[~valid], 0.0)
     # A constant added to all keys changes no softmax, and one edge type leaves nothing to select.
     idle = ("['key']['bias']", "['selection']") if name == "gtn similarity alone" else ("['key']['bias']",)

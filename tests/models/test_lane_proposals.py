@@ -12,7 +12,7 @@ from tests.parameters import random_params, zero_params
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.limits import SettingError
 from tflane_jax.models.bevformer_detr import BevFormerDetrConfig
-from tflane_jax.models.lane_proposals import LaneProposals, best_cells, jittered_middles, lane_middles
+from tflane_jax.models.lane_proposals import LaneProposals, _placed, best_cells, jittered_middles, lane_middles
 from tflane_jax.models.lane_queries import LaneDecoderConfig, LaneProposalConfig
 from tflane_jax.scene import LaneGraph, stack_examples
 from tflane_jax.tasks.lane_graph import LaneGraphTask
@@ -80,6 +80,15 @@ def proposals(bev, lanes=None, mutable=(), config=DECODER):
     module = LaneProposals(config, RANGE)
     params = random_params(module.init, bev, None)
     return module.apply(params, bev, lanes, mutable=list(mutable), rngs={"dropout": jax.random.key(2)})
+
+
+def test_points_are_turned_by_the_bin_and_moved_to_the_cell():
+    points = jnp.array([[[3.0, 1.0, 0.5]]] * 4)
+    center = jnp.array([[10.0, -2.0], [0.0, 0.0], [0.0, 0.0], [5.0, 7.0]])
+    placed = _placed(points, center, jnp.array([0, 2, 1, 6]), 8)
+    half = np.sqrt(0.5)
+    expected = [(13.0, -1.0, 0.5), (-1.0, 3.0, 0.5), (2 * half, 4 * half, 0.5), (6.0, 4.0, 0.5)]
+    np.testing.assert_allclose(placed[:, 0], expected, atol=1e-5)
 
 
 @pytest.mark.slow

@@ -97,6 +97,23 @@ def test_the_draws_cover_their_ranges():
     assert (np.abs(middle).max(0) > 0.054).all()
 
 
+def test_the_draws_of_colours_cover_their_ranges(monkeypatch):
+    """Each factor within its own setting of 1, in any order; lighting along the components by their deviations."""
+    drawn, original = [], augmentation.colour_map
+    monkeypatch.setattr(augmentation, "colour_map", lambda *args: drawn.append(args[:3]) or original(*args))
+    config = replace(COLOUR, brightness=0.1, contrast=0.2, saturation=0.4, lighting=0.3)
+    for seed in range(2000):
+        augment(example(height=4, width=4), config, seed)
+    factors, orders, light = (np.array(each) for each in zip(*drawn, strict=True))
+    strength = (factors - 1.0) / [0.1, 0.2, 0.4]
+    assert np.abs(strength).max() <= 1.0 + 1e-9
+    np.testing.assert_allclose([strength.min(0), strength.max(0)], [[-1.0] * 3, [1.0] * 3], atol=0.01)
+    np.testing.assert_allclose(strength.mean(0), 0.0, atol=0.05)
+    assert len(np.unique(orders, axis=0)) == 6
+    along = light @ augmentation.PCA_VECTORS
+    np.testing.assert_allclose(along.std(0), 0.3 * augmentation.PCA_VALUES, rtol=0.06)
+
+
 def test_a_flip_mirrors_image_and_lines():
     before = example()
     after = augment(before, FLIP, 0)

@@ -96,6 +96,15 @@ def test_distances_are_to_lanes_and_not_to_their_vertices():
     np.testing.assert_allclose(found.markers.lanes[0, 0, :, 1], 0.0)
 
 
+def test_beyond_capacity_the_lanes_nearest_to_the_marker_are_kept():
+    """Not those nearest to the vehicle: it stands on the first, the marker beside the second."""
+    lanes = np.array([[[-5.0, -15, 0], [5, -15, 0]], [[-5, 2, 0], [5, 2, 0]]])
+    store = MarkerStore({5: StoredMarker(5, np.eye(4), lanes, np.zeros((2, 2), bool))}, "survey")
+    pose = yaw_pose(*np.array([[0.0], [15.0], [0.0]]))
+    found = observe(detect(pose, (5,)), store, RANGE, markers=1, lanes=1, points=5)
+    np.testing.assert_allclose(found.markers.lanes[0, 0, :, 1], 17.0)
+
+
 def test_padding_and_nothing_detected():
     padded = detect(PLACED.pose, valid=[True, False, True])
     unpadded = detect(PLACED.pose[[0, 2]], (5, 2))

@@ -71,6 +71,11 @@ def test_errors_grow_with_the_distance(distance, growth, fraction):
     assert np.abs(np.corrcoef(found[:, [0, 3, 4]].T) - np.eye(3)).max() < 0.07
 
 
+def test_every_error_has_a_spread_of_its_own():
+    found = errors(60.0, replace(CLEAR, forward_sigma=1.0, yaw_sigma=4.0, pitch_sigma=0.5))
+    np.testing.assert_allclose(found[:, [0, 3, 4]].std(0), [1.0, 4.0, 0.5], rtol=0.05)
+
+
 def test_jumps():
     found = errors(10.0, replace(MarkerSimulationConfig(detection_sigma=np.inf), occlusion="none"), count=4000)
     jumped = found[:, 5].astype(bool)

@@ -1,15 +1,16 @@
 """Car-following against a scalar IDM, stop lines, priority and pedestrians, on the hand-made crossroads."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from tests.world.crossroads import LIMIT, REACH, STOP, crossroads
 from tflane_jax.world.traffic.demand import _routes
-from tflane_jax.world.traffic.driving import Convoy, acceleration, crossings_busy, footing
+from tflane_jax.world.traffic.driving import Convoy, _merging_leader, acceleration, crossings_busy, footing
 from tflane_jax.world.traffic.lane_table import build_lane_table
-from tflane_jax.world.traffic.pedestrians import crossing_places, draw_crossers
+from tflane_jax.world.traffic.pedestrians import Crossers, CrossingPlaces, crossing_places, draw_crossers
 
 NOBODY = (np.zeros(0, np.intp), np.zeros(0))
 EAST, NORTH = (0, 1, 2), (3, 4, 5)
@@ -97,6 +98,20 @@ def test_a_forking_lane_blocks_its_neighbour(priority_table):
     assert chosen(priority_table, cars)[0] < -2.0
 
 
+def test_a_merging_driver_follows_the_next_vehicle_on_the_main_lane(priority_table):
+    """Both lanes end at one point, so the gap is what is left to it from the front, less what is left from the rear."""
+    main, merging = 1, 6  # segment 2, and the bend, segment 7
+    merges_into = np.where(np.arange(len(priority_table.ids)) == merging, main, -1)
+    table = replace(priority_table, merges_into=merges_into)
+    cars = convoy(table, [(3, merging, 2), EAST, EAST], TO_LINE + np.array([2.0, 12.0, 4.0]), [5.0, 7.0, 6.0])
+    gap, speed = _merging_leader(cars, footing(cars), table)
+    left, left_to_leader = table.length[merging] - 2.0 - 2.25, 2 * STOP - 12.0 + 2.25
+    np.testing.assert_allclose(gap, [left - left_to_leader, np.inf, np.inf])
+    assert speed[0] == 7.0
+    first = replace(cars, position=TO_LINE + np.array([11.0, 12.0, 4.0]))
+    assert _merging_leader(first, footing(first), table)[0][0] == np.inf
+
+
 def test_drivers_stop_for_someone_on_a_crossing(table):
     places = crossing_places(crossroads().walk_across, table)
     np.testing.assert_allclose(places.station, 4.0, atol=0.1)
@@ -107,6 +122,40 @@ def test_drivers_stop_for_someone_on_a_crossing(table):
     assert crossings_busy(cars, footing(cars), places, 1).tolist() == [False]
     near = convoy(table, [EAST], [TO_LINE + 2 * STOP - 6.0], [6.0])
     assert crossings_busy(near, footing(near), places, 1).tolist() == [True]
+
+
+@pytest.mark.parametrize(("gap", "stops"), [(8.0, True), (6.5, False)])
+def test_drivers_brake_twice_as_hard_for_a_pedestrian_as_for_a_red_light(table, gap, stops):
+    """From 10 m/s, 7 m/s^2 takes 7.1 m to a place 1.2 m before the crossing; 3.5 m/s^2 takes 14.3 m."""
+    place = np.array([2]), np.array([20.0])
+    cars = convoy(table, [EAST], [TO_LINE + 2 * STOP + 20.0 - 1.2 - gap - 2.25], [10.0])
+    assert (chosen(table, cars, walked_over=place)[0] < -3.5) == stops
+    before_the_line = convoy(table, [EAST], [TO_LINE - gap - 2.25], [10.0])
+    assert chosen(table, before_the_line, red=(2,))[0] > 0.0
+
+
+@pytest.mark.parametrize("forward", [True, False])
+def test_a_pedestrian_is_in_the_way_from_4_metres_before_a_lane_to_2_behind_it(forward):
+    """In both directions of the crossing, which is 10 m long and has the lane in its middle."""
+    places = CrossingPlaces(np.array([0]), np.array([0.0]), np.array([0]), np.array([5.0]))
+
+    def in_the_way(progress, along=places):
+        walker = Crossers(
+            start=np.zeros((1, 2)),
+            ahead=np.array([[1.0, 0.0]]),
+            length=np.array([10.0]),
+            crossing=np.array([0]),
+            forward=np.array([forward]),
+            pace=np.ones(1),
+            progress=np.array([progress]),
+            side=np.zeros(1),
+        )
+        return walker.in_the_way(along).tolist()
+
+    seen = [in_the_way(progress)[0] for progress in (-0.5, 0.4, 1.0, 5.0, 7.0, 7.5, 10.5)]
+    assert seen == [False, False, True, True, True, False, False]
+    two = CrossingPlaces(np.zeros(2, int), np.zeros(2), np.zeros(2, int), np.array([1.0, 9.0]))
+    assert in_the_way(6.0, two) == ([False, True] if forward else [True, False])
 
 
 def test_pedestrians_wait_at_the_kerb_of_a_busy_crossing():

@@ -118,6 +118,38 @@ def test_coasting_is_straight_on_in_the_world_while_the_ego_turns():
     np.testing.assert_allclose(reported.yaw[12:17, 0], 2.9 - 0.4 * t[12:17], atol=1e-12)
 
 
+def row_of_cars(count):
+    """Return places abreast of each other, 20 m to the left."""
+    return np.stack([np.linspace(-40.0, 40.0, count), np.full(count, 20.0)], -1)
+
+
+def test_a_coasting_track_drifts_by_the_error_of_its_velocity():
+    """In m/s per axis: the error of the place grows by a tenth of it in every frame at 10 Hz."""
+    places, valid = row_of_cars(400), np.ones((9, 400), bool)
+    valid[4:] = False
+    reported = run(actors_at(still(places, 9), [CAR] * 400, valid=valid), replace(PERFECT, coast=5, velocity_noise=0.5))
+    error = reported.position[..., :2] - places
+    frames_lost = np.array([0, 0, 0, 0, 1, 2, 3, 4, 5])
+    np.testing.assert_allclose(error.std(1), np.tile(0.05 * frames_lost[:, None], (1, 2)), rtol=0.1)
+
+
+def test_sizes_are_wrong_by_a_fraction_of_their_own_on_each_axis():
+    """Constant for a track, and drawn independently for length, width and height."""
+    actors = actors_at(still(row_of_cars(400), 2), [CAR] * 400)
+    ratio = run(actors, replace(PERFECT, size_noise=0.05)).size / np.array(CAR)
+    np.testing.assert_allclose(ratio.std(0), 0.05, rtol=0.15)
+    np.testing.assert_allclose(ratio.mean(0), 1.0, atol=0.01)
+    assert np.abs(np.corrcoef(ratio.T) - np.eye(3)).max() < 0.2
+
+
+def test_scaled_noise_scales_misses_errors_and_switches():
+    tracker = TrackerConfig()
+    halved = tracker.with_noise(0.5)
+    for name in ("drop", "position_noise", "position_noise_growth", "yaw_noise", "velocity_noise", "switch_rate"):
+        assert getattr(halved, name) == 0.5 * getattr(tracker, name), name
+    assert tracker.with_noise(100.0).drop == 1.0
+
+
 def test_short_gap_keeps_the_identity_and_long_gap_does_not():
     frames = 30
     valid = np.ones((frames, 1), bool)
@@ -138,6 +170,18 @@ def test_identity_switches_swap_neighbours_and_leave_others_alone():
     assert (reported.position[:, 2, 1] == 30.0).all()
     apart = actors_at(still([[10.0, 0.0], [14.5, 0.0]], frames), [CAR] * 2)
     assert (run(apart, replace(PERFECT, switch_rate=10.0)).position == apart.position).all()
+
+
+def test_tracks_that_have_just_begun_do_not_switch():
+    """Both must have been there in the frame before: a new track has no identity to lose."""
+    frames = 9
+    valid = np.ones((frames, 2), bool)
+    valid[:4, 1] = False
+    actors = actors_at(still([[10.0, 0.0], [12.5, 0.0]], frames), [CAR] * 2, valid=valid)
+    reported = run(actors, replace(PERFECT, switch_rate=10.0))
+    swapped = (np.arange(frames) > 4) & (np.arange(frames) % 2 == 1)
+    np.testing.assert_array_equal(reported.position[:, 0, 0], np.where(swapped, 12.5, 10.0))
+    np.testing.assert_array_equal(reported.position[4:, 1, 0], np.where(swapped, 10.0, 12.5)[4:])
 
 
 def test_rate_of_identity_switches():
@@ -191,6 +235,14 @@ def test_interpolated_line_of_sight_is_exact_where_it_is_computed():
     np.testing.assert_array_equal(some[::4], every[::4])
     np.testing.assert_allclose(some[2], 0.5 * (every[0] + every[4]), atol=1e-12)
     assert (every < 1.0).any()
+
+
+def test_an_actor_that_appears_between_two_looks_is_seen_as_at_the_next_one():
+    valid = np.ones((9, 1), bool)
+    valid[:2] = valid[7:] = False
+    actors = actors_at(still([[20.0, 0.0]], 9), [CAR], valid=valid)
+    fraction = visible_share(actors, standing_ego(9), NO_BUILDINGS, stride=4)
+    np.testing.assert_array_equal(fraction[:, 0], valid[:, 0])
 
 
 def test_padding_is_never_read():

@@ -12,6 +12,7 @@ from tests.world.crossroads import REACH, STOP, crossroads
 from tflane_jax.scene import RoadUser
 from tflane_jax.world.presets import CITY, REAL_LIKE, STREET
 from tflane_jax.world.roads.networks import RoadConfig, SceneKind, build_road_network
+from tflane_jax.world.roads.traffic_control import GREEN, RED, YELLOW
 from tflane_jax.world.traffic.lane_table import build_lane_table
 from tflane_jax.world.traffic.pedestrians import walk_sidewalks
 from tflane_jax.world.traffic.signals import Signals, draw_signals
@@ -240,12 +241,44 @@ def test_pedestrians_walk_on_the_sidewalk_at_walking_pace():
     assert off.max() < 0.7
 
 
+def test_pedestrians_face_where_they_go():
+    """In both directions, round a bend of 30 m radius."""
+    angle = np.linspace(0.0, np.pi / 2, 60)
+    bend = 30.0 * np.stack([np.cos(angle), np.sin(angle)], -1)
+    people = walk_sidewalks(np.random.default_rng(3), (bend,), np.arange(50) / RATE, per_metre=1.0)
+    step, there = np.diff(people.xy, axis=0), people.present[1:] & people.present[:-1]
+    goes = np.arctan2(step[..., 1], step[..., 0])
+    walking = there & (np.hypot(step[..., 0], step[..., 1]) > 0.05)
+    turned = (people.yaw[1:] - goes + np.pi) % (2 * np.pi) - np.pi
+    assert np.abs(turned[walking]).max() < np.deg2rad(2.0)
+    left_round = np.sin(goes[walking] - np.arctan2(people.xy[1:, :, 1], people.xy[1:, :, 0])[walking]) > 0
+    assert 0.2 < left_round.mean() < 0.8
+
+
 def test_signals_against_a_clock():
     signals = Signals(np.array([[10.0, 12.0, 0.0]]), np.array([4.0]))
     for time in np.arange(0.0, 90.0, 0.37):
         at = (time + 4.0) % (10.0 + 3.5 + 12.0 + 3.5)
         expected = 0 if at < 10.0 else -1 if at < 13.5 else 1 if at < 25.5 else -1
         assert signals.green_phase(time)[0] == expected
+
+
+def test_the_phase_that_was_green_shows_yellow_before_all_are_red():
+    signals = Signals(np.array([[10.0, 12.0]]), np.array([0.0]))
+    expected = {
+        9.9: [GREEN, RED],
+        10.1: [YELLOW, RED],
+        12.4: [YELLOW, RED],
+        12.6: [RED, RED],
+        13.4: [RED, RED],
+        13.6: [RED, GREEN],
+        25.6: [RED, YELLOW],
+        28.9: [RED, RED],
+        29.1: [GREEN, RED],
+    }
+    for time, states in expected.items():
+        assert signals.shown(time)[0].tolist() == states, time
+    np.testing.assert_array_equal(signals.shown(np.array(list(expected)))[:, 0], list(expected.values()))
 
 
 def test_networks_without_lights_have_no_red():

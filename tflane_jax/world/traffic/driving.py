@@ -17,7 +17,7 @@ from tflane_jax.world.traffic.pedestrians import CrossingPlaces
 
 # IDM: gap kept at rest (metres), comfortable braking (m/s^2); and the hardest braking of all.
 _REST_GAP, _BRAKING, _HARDEST = 2.0, 2.0, 7.0
-# A driver stops for a red light or a pedestrian if this braking suffices, m/s^2.
+# A driver stops for a red light if this braking suffices, and for a pedestrian if twice as much does, m/s^2.
 _STOPS_IF = 3.5
 # Accepted gap in priority traffic, seconds, and distance below which priority traffic always blocks, metres.
 _ACCEPTED_GAP, _AT_HAND = 3.2, 3.0

@@ -1,6 +1,7 @@
 """What the traffic-flow module computes, against the formulas in numpy."""
 
 import dataclasses
+from functools import partial
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from tests.models.test_traffic_flow_module import CONFIG, DIM, LANES, apply, spa
 from tests.parameters import random_params
 from tflane_jax.models.traffic_flow_module import ALL_FUSIONS, LANE_FUSIONS, TemporalEncoder
 
-CLOSE = {"rtol": 1e-3, "atol": 1e-4}
+assert_close = partial(np.testing.assert_allclose, rtol=1e-3, atol=1e-4)
 
 
 def dense(params, x):
@@ -62,7 +63,7 @@ def test_a_token_is_computed_from_all_that_is_known_of_its_track(depth):
         mean = normalised(params["norm"], x)[there].mean(0)
         first, last = np.flatnonzero(there)[[0, -1]]
         expected = feed_forward(params["token"], np.concatenate([mean, places[k][first], places[k][last]]))
-        np.testing.assert_allclose(found[k], expected, **CLOSE)
+        assert_close(found[k], expected)
 
 
 @pytest.mark.parametrize("fusions", [ALL_FUSIONS, LANE_FUSIONS])
@@ -91,4 +92,4 @@ def test_lanes_and_traffic_are_fused_by_eq_2_and_3(fusions, residual):
     x = fused("L->T", lanes, lanes + position, t, t, valid)
     x = fused("L->L", x, x + position, x + position, x, np.ones((LANES, LANES), bool))
     expected = normalised(params["transform_norm"], x + feed_forward(params["transform"], x))  # Eq. (3)
-    np.testing.assert_allclose(apply(module, variables, *arguments), expected, **CLOSE)
+    assert_close(apply(module, variables, *arguments), expected)

@@ -9,9 +9,9 @@ from tflane_jax.evaluation.found_lanes import (
     WITHIN,
     best_threshold,
     confidences_of,
+    detection_scores,
     frames_of_difference,
     lane_confidences,
-    lane_scores,
 )
 from tflane_jax.evaluation.lane_graph import LaneGraphMetrics
 from tflane_jax.metrics.centerline_matching import relaxation
@@ -77,7 +77,7 @@ def test_without_threshold_the_found_segments_are_the_recall_of_the_metric():
         confidence = confidences_of(segments, prediction)
         assert not np.isfinite(confidence[6:]).any()
         found.append(np.isfinite(confidence[:6]))
-        assert lane_scores(prediction)[0] == 0.0
+        assert detection_scores(prediction)[0] == 0.0
     assert 0.1 < np.mean(found) < 1.0
     assert metrics.compute()["all"][f"recall@{WITHIN:.1f}"] == pytest.approx(np.mean(found))
 

@@ -12,7 +12,7 @@ from tests.fakes import fake_example
 from tflane_jax.datasets.map_geometry import MapGeometry
 from tflane_jax.datasets.map_lines import MapLinesConfig, crop_map_lines
 from tflane_jax.datasets.procedural import STREET_EXAMPLE, ProceduralDataset, WorldData
-from tflane_jax.evaluation.found_lanes import lane_scores
+from tflane_jax.evaluation.found_lanes import detection_scores
 from tflane_jax.evaluation.lane_groups import LANE_GROUPS, line_groups
 from tflane_jax.evaluation.map_metrics import MapLineMetrics
 from tflane_jax.evaluation.vector_maps import detections_of_lines
@@ -145,7 +145,7 @@ def test_at_most_fifty_pairs_are_detections():
     found = LinePrediction(np.zeros((70, 4, 2)), logits)
     best = np.sort(1 / (1 + np.exp(-logits.ravel())))[::-1][:50]
     np.testing.assert_allclose(detections_of_lines(found).scores, best)
-    np.testing.assert_allclose(lane_scores(found), best)
+    np.testing.assert_allclose(detection_scores(found), best)
     assert len(detections_of_lines(LinePrediction(np.zeros((49, 4, 2)), logits[:49])).scores) == 49
 
 

@@ -19,7 +19,7 @@ from tflane_jax.datasets.loading import load_arrays
 from tflane_jax.datasets.map_lines import MapLinesConfig
 from tflane_jax.datasets.procedural import STREET_EXAMPLE, ProceduralDataset, WorldData
 from tflane_jax.errors import UserError
-from tflane_jax.evaluation.found_lanes import confidences_of, lane_scores
+from tflane_jax.evaluation.found_lanes import confidences_of, detection_scores
 from tflane_jax.evaluation.lane_groups import LANE_GROUPS
 from tflane_jax.evaluation.results import EvaluationConfig
 from tflane_jax.losses.common import HostLossConfig
@@ -182,4 +182,4 @@ def test_confidences_of_lines_are_those_of_their_class():
     found = LinePrediction(points, np.array([[1.0, -9.0, -2.0], [0.0, -9.0, -9.0]]))
     # The second detection lies on the boundary, but is a divider.
     assert confidences_of(lines, found).tolist() == [pytest.approx(1 / (1 + np.exp(-1.0))), -np.inf, -np.inf, -np.inf]
-    np.testing.assert_allclose(lane_scores(found), 1 / (1 + np.exp([-1.0, 0.0])))
+    np.testing.assert_allclose(detection_scores(found), 1 / (1 + np.exp([-1.0, 0.0])))

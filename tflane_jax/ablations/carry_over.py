@@ -152,9 +152,9 @@ def _evaluated(plan: Plan, failures: list[Failure]) -> tuple[ByLog, dict[str, se
                     ways |= {f"{row}, {NO_TRAFFIC}": own.ways[NO_TRAFFIC], f"{row}, {OTHER}": swapped.ways[""]}
                 for name, scores in ways.items():
                     of_log = found.setdefault(name, {}).setdefault(log, {})
-                    of_log[job.config.training.seeds[0]] = scores
+                    of_log[job.seed] = scores
     seeds = {
-        log: {job.config.training.seeds[0] for row in plan.jobs for job in plan.of(row, log)}.intersection(
+        log: {job.seed for row in plan.jobs for job in plan.of(row, log)}.intersection(
             *(by_log.get(log, {}) for by_log in found.values())
         )
         for log in plan.logs

@@ -55,11 +55,11 @@ def mixed_hosts(rows: Sequence[TableRow], trained: Mapping[str, Sequence[Job]]) 
     found: dict[str, dict[int, set[tuple[str, ...]]]] = {}
     for row in rows:
         for job in trained.get(row.name, ()) if row.start else ():
-            (seed,) = job.config.training.seeds
+            seed = job.seed
             found.setdefault(row.start, {}).setdefault(seed, set()).add(facts(job).origins)
     for row in rows:
         for job in trained.get(row.name, ()) if row.name in found else ():
-            (seed,) = job.config.training.seeds
+            seed = job.seed
             started, gives = found[row.name].get(seed, set()), given_hashes(job)
             if gives and not any(set(gives) & set(of_row) for of_row in started):
                 started.add(gives)

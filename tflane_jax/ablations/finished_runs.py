@@ -71,7 +71,7 @@ def evaluate_runs(trained: Mapping[str, Sequence[Job]], results: Results) -> lis
             if any(failure.job is job for failure in failures):
                 continue
             with noted(job, failures):
-                (seed,) = job.config.training.seeds
+                seed = job.seed
                 config = with_test_set(job.config, results.tests.get(test, ()))
                 for which in CHECKPOINTS:
                     if (measured := measure(job, config, which)) is not None:

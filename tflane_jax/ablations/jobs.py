@@ -65,6 +65,12 @@ class Job:
     recorded: RecordedRun | None = None
 
     @property
+    def seed(self) -> int:
+        """The seed of the training."""
+        (seed,) = self.config.training.seeds
+        return seed
+
+    @property
     def log(self) -> Path:
         """File for messages: everything that a worker process prints, or the error of a training in this process."""
         return self.folder.with_name(f"{self.folder.name}.log")

@@ -194,7 +194,7 @@ def unused(plan: Plan, archive: Archive, scores: Collection[str]) -> list[str]:
     lines = []
     for name, jobs in plan.items():
         for job in jobs:
-            (seed,) = job.config.training.seeds
+            seed = job.seed
             run = archive.runs.get(job.folder.name) or by_name.get((name, seed))
             if job.recorded is None and run is not None:
                 reason = _why_not(run, job, scores) or "runs of different devices do not meet in a table"
@@ -319,7 +319,7 @@ def _recorded(key: str, row: str, job: Job, scores: Collection[str], curves: Col
     return RecordedRun(
         key=key,
         row=row,
-        seed=job.config.training.seeds[0],
+        seed=job.seed,
         config=portable(job),
         threads=dict(job.threads),
         # Runs that start from another one are no hosts.

@@ -52,7 +52,7 @@ class TablePlan:
 
     def seeds(self) -> list[int]:
         """Return the seeds of the rows."""
-        return [job.config.training.seeds[0] for job in next(iter(self.jobs.values()))]
+        return [job.seed for job in next(iter(self.jobs.values()))]
 
     def declared(self) -> dict[str, RunConfig]:
         """Return the configurations of all trainings; a row that starts from a host names it in place of its folder."""
@@ -157,7 +157,7 @@ def _other_hosts(plan: TablePlan) -> list[str]:
         for job in plan.jobs[row.name] if row.start else ():
             if job.recorded is not None or not job.is_complete():
                 by_seed = found.setdefault(row.start, {})
-                by_seed.setdefault(job.config.training.seeds[0], set()).add(job.recorded is not None)
+                by_seed.setdefault(job.seed, set()).add(job.recorded is not None)
     return [
         f"recorded runs of seed{'s' if len(mixed) > 1 else ''} {', '.join(map(str, mixed))} start from an earlier "
         f"training of {host}, the others from one of this machine, which may differ: without --from, all start from one"

@@ -265,7 +265,7 @@ def _add_geometric(trained: Mapping[str, Sequence[Job]], results: Results) -> No
     """Add to every row that predicts topology its score with the geometric topology, at the last checkpoint."""
     pairs = [(name, job) for name, jobs in trained.items() for job in jobs]
     for name, job in progress_bar(pairs, desc="evaluate with geometric topology", unit="run"):
-        scores = results.scores[OWN_TEST, "last"][name][job.config.training.seeds[0]]
+        scores = results.scores[OWN_TEST, "last"][name][job.seed]
         for evaluation in job.further:
             measured = measure(job, replace(job.config, evaluation=evaluation), "last")
             if measured is not None:

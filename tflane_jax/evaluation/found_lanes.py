@@ -39,7 +39,7 @@ def confidences_of(
         return _line_confidences(truth, found)
     valid, names = np.asarray(truth.valid), ("points", "left", "right")
     true = [np.asarray(getattr(truth, name))[valid] for name in names]
-    confidences, scores = np.full(len(valid), -np.inf), lane_scores(found)
+    confidences, scores = np.full(len(valid), -np.inf), detection_scores(found)
     if isinstance(found, SegmentPrediction):
         lines = [np.asarray(getattr(found, name))[scores > 0.0] for name in names]
         confidences[valid] = segment_confidences(true, lines, scores[scores > 0.0])
@@ -58,7 +58,7 @@ def _line_confidences(truth: MapLines, found: LinePrediction) -> Float[np.ndarra
     return confidences
 
 
-def lane_scores(found: CenterlinePrediction | SegmentPrediction | LinePrediction) -> Float[np.ndarray, "*b p"]:
+def detection_scores(found: CenterlinePrediction | SegmentPrediction | LinePrediction) -> Float[np.ndarray, "*b p"]:
     """Return the confidences of detected lanes, 0 for crossings; of lines those of the best pairs of query, class."""
     if isinstance(found, LinePrediction):
         every = expit(np.asarray(found.logits, np.float64))

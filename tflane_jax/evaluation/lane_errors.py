@@ -27,7 +27,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from tflane_jax.errors import UserError
-from tflane_jax.evaluation.found_lanes import WITHIN, best_threshold, highest_confidences, lane_scores
+from tflane_jax.evaluation.found_lanes import WITHIN, best_threshold, detection_scores, highest_confidences
 from tflane_jax.evaluation.lane_groups import HALF, HEADING, SAMPLES
 from tflane_jax.evaluation.predict import Predictor, predicted_batches
 from tflane_jax.geometry import resample_lines
@@ -102,7 +102,7 @@ def _compared(answer: Prediction, batch: Any) -> tuple[CenterlinePrediction | Se
 
 def frame_of(truth: LaneGraph, found: CenterlinePrediction | SegmentPrediction) -> Frame:
     """Return one frame; padding of the truth may hold anything, crossings among segments are left out."""
-    valid, scores = np.asarray(truth.valid), lane_scores(found)
+    valid, scores = np.asarray(truth.valid), detection_scores(found)
     center, left, right = (np.asarray(line)[valid] for line in (truth.points, truth.left, truth.right))
     if not isinstance(found, SegmentPrediction):
         points = np.asarray(found.points)

@@ -22,8 +22,8 @@ from tflane_jax.evaluation.found_lanes import (
     WITHIN,
     best_threshold,
     confidences_of,
+    detection_scores,
     frames_of_difference,
-    lane_scores,
 )
 from tflane_jax.evaluation.interventions import scene_numbers
 from tflane_jax.evaluation.lane_groups import lane_groups, line_groups
@@ -181,7 +181,7 @@ def _answers(model: Model, data: Example | Streamed, field: Field) -> _Answers:
         model.task, model.params, data, model.batch_size, what=FOR_PICTURES
     ):
         lanes.append(answer.lanes)
-        scores.append(lane_scores(lanes[-1]))
+        scores.append(detection_scores(lanes[-1]))
         for row in range(len(indices)):
             truth, found = jax.tree.map(lambda leaf, i=row: np.asarray(leaf[i]), (getattr(batch, field), lanes[-1]))
             confidences.append(confidences_of(truth, found))

@@ -65,6 +65,22 @@ def test_a_road_user_out_of_view_is_labelled_on_its_track(ax):
     assert len(ax.texts) == 0
 
 
+def test_a_track_without_a_valid_frame_is_left_out(ax):
+    flow = fake_example().traffic_flow
+    flow.valid[0] = False
+    draw_road_users(ax, flow, np.array([0, 1]), np.ones(2))
+    assert len(ax.collections) == 2
+    assert [text.get_text() for text in ax.texts] == ["1"]
+
+
+def test_numbers_do_not_cover_the_title(ax):
+    flow = fake_example().traffic_flow
+    low, high = ax.get_ylim()
+    flow.position[0, 2:, :2], flow.position[1, 2:, :2] = [0.0, high - 2.0], [10.0, 0.5 * (low + high)]
+    draw_road_users(ax, flow, np.array([0, 1]), np.ones(2))
+    assert [text.xyann[1] for text in ax.texts] == [-11, 11]
+
+
 @pytest.mark.parametrize("count", [0, 1, 3])
 def test_bars_start_at_the_top(ax, count):
     values = np.arange(count) / 10
@@ -79,3 +95,9 @@ def test_curves_have_their_names(ax):
     draw_removal(ax, {"a": np.array([0.5, 0.1]), "b": np.array([0.5])}, title="t")
     assert [text.get_text() for text in ax.get_legend().get_texts()] == ["a", "b"]
     np.testing.assert_allclose(ax.lines[0].get_xydata(), [[0, 0.5], [1, 0.1]])
+
+
+@pytest.mark.filterwarnings("error")
+def test_no_curves_have_no_legend(ax):
+    draw_removal(ax, {}, title="t")
+    assert ax.get_legend() is None

@@ -113,6 +113,37 @@ def test_a_model_has_one_colour_in_all_panels(tmp_path, figures):
     assert legend.get_window_extent().y1 <= second.get_window_extent().y0
 
 
+def test_a_seed_that_becomes_infinite_leaves_the_others_in_the_panel(tmp_path, figures):
+    values = [[1.0, 2.0], [1.5, 2.0], [1.0, np.inf], [3.0, np.nan], [np.inf, np.nan]]
+    records = [{"step": step, "split": "train", "loss": value} for step, value in enumerate(values)]
+    save_curves(tmp_path / "curves.png", records)
+    (ax,) = figures[0].axes
+    np.testing.assert_array_equal(ax.lines[0].get_ydata(), [1.5, 1.75, np.nan, np.nan, np.nan])
+    heights = ax.collections[0].get_paths()[0].vertices[:, 1]
+    assert (heights.min(), heights.max()) == (1.0, 3.0)
+    assert 3.0 < ax.get_ylim()[1] < 4.0
+
+
+@pytest.mark.parametrize(
+    ("values", "marked"),
+    [([1.0], [True]), ([np.nan, 1.0, np.inf], [False, True, False]), ([1.0, 2.0, np.nan, 1.0], [False] * 3 + [True])],
+)
+def test_a_step_without_neighbours_has_a_marker(tmp_path, figures, values, marked):
+    save_curves(tmp_path / "curves.png", [{"step": step, "loss": value} for step, value in enumerate(values)])
+    (line,) = figures[0].axes[0].lines
+    assert (line.get_marker(), line.get_markevery()) == ("o", marked)
+
+
+def test_long_titles_stay_within_their_panels(tmp_path, figures):
+    names = ["hidden-traffic/recall", "hidden-neighbours/recall", "all/AP"]
+    save_comparison_curves(
+        tmp_path / "a.png", {"a": [[{"split": "val", "step": 5} | dict.fromkeys(names, 0.5)]]}, names
+    )
+    first, second, third = figures[0].axes
+    for ax, end in ((first, second.get_window_extent().x0), (second, third.get_window_extent().x0)):
+        assert ax._left_title.get_window_extent().x1 < end
+
+
 @pytest.mark.parametrize("steps", [(5,), (5, 9)])
 def test_models_that_were_validated_once_are_points_and_not_curves(tmp_path, figures, steps):
     def run(value):

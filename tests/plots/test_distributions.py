@@ -37,6 +37,20 @@ def test_a_yes_or_no_has_two_ticks(monkeypatch):
     np.testing.assert_allclose(ax.patches[0].get_data().values, [1 / 3, 2 / 3])
 
 
+def test_values_that_are_not_finite_are_left_out(monkeypatch):
+    pytest.importorskip("matplotlib")
+    first, second = panels(monkeypatch, {"a": {"x": np.array([np.nan, 0.5, 2.5, np.inf]), "y": np.array([np.nan])}})
+    assert first.patches[0].get_data().values.sum() == pytest.approx(1.0)
+    assert len(second.patches) == 0
+
+
+def test_large_values_are_told_apart(monkeypatch):
+    """An axis from 0 had both in its last bin."""
+    pytest.importorskip("matplotlib")
+    (ax,) = panels(monkeypatch, {"a": {"x": np.array([1000.5, 1001.5])}})
+    assert sorted(ax.patches[0].get_data().values)[-2:] == [0.5, 0.5]
+
+
 def test_every_value_is_counted_once(monkeypatch):
     pytest.importorskip("matplotlib")
     rng = np.random.default_rng(0)

@@ -8,8 +8,8 @@ import pytest
 from tests.fakes import FakeConfig, FakeDataset, empty_example, fake_example, fake_prediction
 from tests.plots.pictures import count_colours
 from tflane_jax.errors import UserError
-from tflane_jax.plots.figure import new_figure, save_figure
-from tflane_jax.plots.gallery import save_examples, show_dataset
+from tflane_jax.plots.figure import hide_unused, new_figure, save_figure
+from tflane_jax.plots.gallery import label_edges, save_examples, show_dataset
 from tflane_jax.scene import stack_examples
 
 pytest.importorskip("matplotlib")
@@ -62,6 +62,16 @@ def test_titles_and_legend_of_a_single_row_are_not_cut_off(tmp_path):
     ):
         pixels = imread(picture)[..., :3]
         assert pixels[0].min() == pixels[-1].min() == 1.0, picture.name
+
+
+def test_the_lowest_panel_of_each_column_has_labels():
+    """Of three examples in two columns, the second had none: the panel below it is blank."""
+    _, axes = new_figure(2, 4)
+    hide_unused(axes, 6)
+    label_edges(axes)
+    assert [bool(ax.get_xlabel()) for ax in axes.flat] == [False, False, True, True, True, True, False, False]
+    ticks = [ax.xaxis.get_tick_params()["labelbottom"] for ax in axes.flat[:6]]
+    assert ticks == [False, False, True, True, True, True]
 
 
 @pytest.mark.parametrize(("size", "count"), [(0, 3), (3, 0)])

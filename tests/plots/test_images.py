@@ -28,6 +28,17 @@ def test_lanes_are_drawn_into_a_copy_of_a_frame():
     np.testing.assert_array_equal(lanes_drawn(frame, []), frame)
 
 
+@pytest.mark.filterwarnings("error")
+def test_points_that_are_not_there_are_gaps_of_a_lane():
+    pytest.importorskip("cv2")
+    frame, none = np.zeros((40, 60, 3), np.uint8), [np.nan, np.nan]
+    lane = np.array([none, [10.0, 5.0], [10.0, 15.0], none, [10.0, 25.0], [10.0, 35.0], none])
+    marked = lanes_drawn(frame, [lane, np.array([none]), np.zeros((0, 2))])[:, 10].any(-1)
+    assert marked[5:16].all()
+    assert marked[25:36].all()
+    assert not marked[18:23].any()
+
+
 def drawn(*curves):
     """Return what is drawn of curves (upper, lower, k'', f'', m'', n', b'', b''') that are all lanes."""
     logits = np.tile([0.0, 1.0], (len(curves), 1))

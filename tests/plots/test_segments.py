@@ -138,7 +138,14 @@ def test_the_legend_of_camera_images_names_what_is_drawn():
     above = [entry.get_label() for entry in above_entries(fake_segments(), with_segments())]
     assert above == ["truth, in predictions", "predicted lane (fainter: unsure)", "predicted topology"]
     truth = [entry.get_label() for entry in above_entries(None, with_segments())]
-    assert truth == ["ground out of sight", "lane in sight", "lane partly in sight", "lane out of sight"]
+    assert truth[:4] == ["ground out of sight", "lane in sight", "lane partly in sight", "lane out of sight"]
+    assert truth[4:6] == ["road boundary", "crossing"]
+    assert truth[6:] == [
+        *("car", "truck", "bus", "motorcycle", "bicycle", "pedestrian", "road user not seen"),
+        *("traffic light", "traffic sign"),
+    ]
+    bare = with_segments().replace(hidden=None, traffic_flow=None, traffic_elements=None)
+    assert [entry.get_label() for entry in above_entries(None, bare)] == truth[1:6]
 
 
 @pytest.mark.slow

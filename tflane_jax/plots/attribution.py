@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 
 FAINT = 0.12
 """Opacity of a track with weight 0; the largest weight of a picture has opacity 1."""
+# Labels of points above this fraction of the panel's height stand below them: above, they would cover its title.
+_HIGHEST_LABEL = 0.85
 
 
 def draw_lane_bands(ax: Axes, lanes: Float[Array, "g n 3"]) -> None:
@@ -44,10 +46,12 @@ def draw_road_users(
 ) -> None:
     """Draw tracks with an opacity by weight, numbered 0, 1, ... in the order given, over a scene with its limits set.
 
+    Tracks without a valid frame are left out; the others keep their numbers.
+
     Args:
         ax: where to draw.
         flow: traffic flow of the frame.
-        road_users: tracks in it, each with a valid frame.
+        road_users: tracks in it.
         weights: of each, for example attention.
         absent: positions in `road_users` that are drawn as an empty, crossed-out box.
     """
@@ -56,11 +60,13 @@ def draw_road_users(
 
     values = np.asarray(weights, np.float64)
     strength = (FAINT + (1.0 - FAINT) * values / max(values.max(initial=0.0), 1e-9)).tolist()
-    paths: list[np.ndarray] = []
+    paths: dict[int, np.ndarray] = {}
     for i, user in enumerate(np.asarray(road_users).tolist()):
         seen = np.flatnonzero(np.asarray(flow.valid)[user])
-        path, last = np.asarray(flow.position)[user, seen, :2], seen[-1]
-        paths.append(path)
+        if not len(seen):
+            continue
+        paths[i] = path = np.asarray(flow.position)[user, seen, :2]
+        last = seen[-1]
         (box,) = box_corners(path[-1:], np.asarray(flow.yaw)[[user], last], np.asarray(flow.size)[[user], :2])
         lines, colour, fill = [path], to_rgba(style.LINK, strength[i]), to_rgba(style.LINK, 0.6 * strength[i])
         if i in absent:
@@ -72,7 +78,7 @@ def draw_road_users(
         ax.annotate(
             str(i),
             place.tolist(),
-            (0, 11),
+            (0, -11 if ax.transLimits.transform(place)[1] > _HIGHEST_LABEL else 11),
             textcoords="offset points",
             ha="center",
             va="center",
@@ -126,18 +132,22 @@ def draw_removal(ax: Axes, scores: Mapping[str, Float[Array, " n"]], *, title: s
     ax.set_ylabel("score of the lane", fontsize=8)
     ax.tick_params(labelsize=7)
     ax.grid(alpha=0.3, lw=0.5)
-    ax.legend(fontsize=7, frameon=False)
+    if scores:
+        ax.legend(fontsize=7, frameon=False)
 
 
-def _label_places(ax: Axes, paths: Sequence[np.ndarray]) -> dict[int, np.ndarray]:
+def _label_places(ax: Axes, paths: Mapping[int, np.ndarray]) -> dict[int, np.ndarray]:
     """Return for each path that has a point in view, 1.5 m inside the limits, the point to label.
 
     That is its last point. If it is out of view, it is the point in view that is farthest from the other labels.
     """
     (left, right), (low, high) = ((start + 1.5, end - 1.5) for start, end in (ax.get_xlim(), ax.get_ylim()))
-    inside = [(p[:, 0] > left) & (p[:, 0] < right) & (p[:, 1] > low) & (p[:, 1] < high) for p in paths]
-    places = {i: path[-1] for i, path in enumerate(paths) if inside[i][-1]}
-    for i, path in enumerate(paths):
+    inside = {
+        i: (path[:, 0] > left) & (path[:, 0] < right) & (path[:, 1] > low) & (path[:, 1] < high)
+        for i, path in paths.items()
+    }
+    places = {i: path[-1] for i, path in paths.items() if inside[i][-1]}
+    for i, path in paths.items():
         if i not in places and inside[i].any():
             points, others = path[inside[i]], np.array([*places.values()]).reshape(-1, 2)
             nearest = np.linalg.norm(points[:, None] - others, axis=-1).min(1, initial=1e9)

@@ -61,8 +61,8 @@ _POINTS = 201
 _DASHES = {LineType.NONE: (0.5, 2.0), LineType.SOLID: None, LineType.DASHED: (2.5, 5.0)}
 # Lanes are cut off at this depth, metres.
 _NEAR = 0.5
-# Entries of a legend in a row.
-_ENTRIES = 7
+# Entries of a legend in a row, and the height of a row, inches.
+_ENTRIES, _ROW = 7, 0.16
 # Images smaller than this are shown with sharp pixels.
 _PIXELATED = 400
 
@@ -115,7 +115,10 @@ def save_camera_views(
     ahead, back = _rows_of_cameras(first.cameras)
     columns = max(len(ahead) + 1, len(back))
     height, width = examples.cameras.image.shape[2:4]
-    figure, axes = new_figure(2 * count, columns, panel=(_PANEL, _PANEL * min(height / width, 0.8) + 0.25), footer=0.45)
+    entries = _page_entries(lanes, examples)
+    rows = -(-len(entries) // _ENTRIES)
+    size = _PANEL, _PANEL * min(height / width, 0.8) + 0.25
+    figure, axes = new_figure(2 * count, columns, panel=size, footer=0.13 + _ROW * rows)
     for ax in axes.flat:
         ax.set_axis_off()
     for row, title in enumerate(titles):
@@ -128,14 +131,18 @@ def save_camera_views(
         above = axes[2 * row, len(ahead)]
         above.set_axis_on()
         _draw_above(above, example, found, title, threshold, ground, view)
+    across = -(-len(entries) // rows)
+    figure.legend(handles=entries, loc="outside lower center", ncols=across, fontsize=7, frameon=False)
+    return save_figure(figure, path)
+
+
+def _page_entries(lanes: LanePrediction | None, examples: Example) -> list:
+    """Return the entries of the legend: what the camera images show, then what the view from above adds."""
     entries = legend_entries(lanes)
     for entry in above_entries(lanes, examples):
         entry.set_label(f"from above: {entry.get_label()}")
         entries.append(entry)
-    rows = -(-len(entries) // _ENTRIES)
-    columns = -(-len(entries) // rows)
-    figure.legend(handles=entries, loc="outside lower center", ncols=columns, fontsize=7, frameon=False)
-    return save_figure(figure, path)
+    return entries
 
 
 def draw_camera(

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import functools
+import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from tflane_jax.errors import UserError
 from tflane_jax.files.wording import counted
 from tflane_jax.metrics.directions import lower_is_better, unit_of
 from tflane_jax.plots import style
-from tflane_jax.plots.figure import columns_for, hide_unused, new_figure, save_figure
+from tflane_jax.plots.figure import TITLE, columns_for, hide_unused, new_figure, save_figure
 from tflane_jax.plots.names import score_title
 
 if TYPE_CHECKING:
@@ -33,6 +34,7 @@ def save_curves(path: Path, records: Iterable[Mapping[str, Any]]) -> Path:
     The loss comes first, then the scores, then the rest of the training's records. Several seeds are drawn as their
     mean and a band from minimum to maximum. Scores at single thresholds
     ("recall@1.0") are left out. Values of training have a logarithmic axis if they span more than a factor of 30.
+    The line has a gap where the value of a seed is not finite; the band is that of the other seeds.
 
     Args:
         path: .png, .pdf or .svg.
@@ -102,7 +104,8 @@ def save_comparison_curves(
     once = [len(steps) for steps in schedules] == [1]
     draw = _draw_points if once else _draw_panel
     for ax, (name, series) in zip(axes.flat, panels.items(), strict=False):
-        ax.set_title(f"validation: {score_title(name)}, {unit_of(name)[1]}", fontsize=9, loc="left")
+        title = f"validation: {score_title(name)}, {unit_of(name)[1]}"
+        ax.set_title(textwrap.fill(title, TITLE), fontsize=9, loc="left")
         draw(ax, series, styles)
     hide_unused(axes, len(panels))
     lines = {str(line.get_label()): line for ax in axes.flat for line in ax.lines}
@@ -186,10 +189,14 @@ def _draw_panel(
     from matplotlib.ticker import MaxNLocator
 
     for name, (steps, values) in series.items():
-        # A single point needs a marker to be visible.
-        ax.plot(steps, values.mean(1), **styles[name], lw=1.4, label=name, marker="o" if len(steps) == 1 else "")
+        # Infinite values would leave the axis without limits.
+        known = np.isfinite(values)
+        mean = np.where(known.all(1), np.where(known, values, 0.0).mean(1), np.nan)
+        alone = _without_neighbours(~np.isnan(mean))
+        look = {"marker": "o", "markevery": alone.tolist()} if alone.any() else {}
+        ax.plot(steps, mean, **styles[name], **look, lw=1.4, label=name)
         if values.shape[1] > 1:
-            ax.fill_between(steps, values.min(1), values.max(1), color=styles[name]["color"], alpha=0.2, lw=0)
+            ax.fill_between(steps, *_bounds(values, known), color=styles[name]["color"], alpha=0.2, lw=0)
     seen = np.concatenate([values.reshape(-1) for _, values in series.values()])
     seen = seen[np.isfinite(seen)]
     if log and len(seen) and seen.min() > 0.0 and seen.max() > 30.0 * seen.min():
@@ -200,3 +207,16 @@ def _draw_panel(
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     ax.tick_params(labelsize=7)
     ax.grid(alpha=0.3, lw=0.5)
+
+
+def _bounds(values: Float[np.ndarray, "n seeds"], known: Bool[np.ndarray, "n seeds"]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the least and the greatest known value of each step, NaN where none is known."""
+    some = known.any(1)
+    least = np.where(some, values.min(1, where=known, initial=np.inf), np.nan)
+    return least, np.where(some, values.max(1, where=known, initial=-np.inf), np.nan)
+
+
+def _without_neighbours(known: Bool[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
+    """Return which points of a line are known and stand alone: without a marker, nothing of them is seen."""
+    padded = np.pad(known, 1)
+    return known & ~padded[:-2] & ~padded[2:]

@@ -19,23 +19,27 @@ _SHOWN = 0.99
 
 
 def save_distributions(path: Path, values: Mapping[str, Mapping[str, Float[np.ndarray, " _"]]]) -> Path:
-    """Write a picture with a histogram of each dataset in each panel, as fractions of the dataset's values.
+    """Write a picture with a histogram of each dataset in each panel, as fractions of the dataset's finite values.
 
     Args:
         path: .png, .pdf or .svg.
-        values: by dataset, by quantity; quantities that a dataset lacks or has no value of are left out.
+        values: by dataset, by quantity; quantities that a dataset lacks or has no finite value of are left out.
     """
     from matplotlib.lines import Line2D
 
-    names = list(dict.fromkeys(name for found in values.values() for name in found))
+    finite = {
+        dataset: {name: numbers[np.isfinite(numbers)] for name, numbers in found.items()}
+        for dataset, found in values.items()
+    }
+    names = list(dict.fromkeys(name for found in finite.values() for name in found))
     columns = min(4, max(len(names), 1))
     figure, axes = new_figure(max(-(-len(names) // columns), 1), columns, panel=(3.2, 2.3), footer=0.3)
     for ax, name in zip(axes.flat, names, strict=False):
-        every = np.concatenate([found[name] for found in values.values() if name in found])
-        low, high = float(every.min(initial=0.0)), float(np.quantile(every, _SHOWN)) if len(every) else 1.0
+        every = np.concatenate([found[name] for found in finite.values() if name in found])
+        low, high = (float(every.min()), float(np.quantile(every, _SHOWN))) if len(every) else (0.0, 1.0)
         whole = bool(np.all(every == np.round(every)))
         edges = _edges(low, high, whole=whole)
-        for number, found in enumerate(values.values()):
+        for number, found in enumerate(finite.values()):
             if len(found.get(name, ())):
                 count, _ = np.histogram(np.clip(found[name], edges[0], edges[-1]), edges)
                 ax.stairs(count / len(found[name]), edges, color=style.curve_style(number)["color"], lw=1.3)

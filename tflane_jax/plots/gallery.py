@@ -10,15 +10,16 @@ import numpy as np
 
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import PerceptionRange
-from tflane_jax.plots import style
 from tflane_jax.plots.bev import GROUND, INPUTS, VIEW, Layer, draw_found, draw_scene, inputs_title, truth_layers
 from tflane_jax.plots.figure import hide_unused, new_figure, save_figure
 from tflane_jax.plots.legends import (
+    area_entries,
     boundary_entries,
-    crossing_entry,
+    element_entries,
     evidence_entries,
     hidden_entries,
     prediction_entries,
+    traffic_entries,
     truth_entry,
     visibility_entries,
 )
@@ -164,19 +165,11 @@ def add_legend(
         drawn: layers of true lanes.
         examples: whose inputs are named, one or several; None: evidence and traffic.
     """
-    from matplotlib.lines import Line2D
-    from matplotlib.patches import Patch
-
     entries: list = [
         *(class_entries() if "map_lines" in drawn else visibility_entries()),
         *hidden_entries(examples),
-    ]
-    if examples is None or examples.traffic_flow is not None:
-        entries += [Patch(facecolor=colour, label=user.name.lower()) for user, colour in style.ROAD_USER.items()]
-        entries.append(Patch(facecolor="none", edgecolor=style.OTHER_ELEMENT, label="road user not seen"))
-    entries += [
-        Line2D([], [], color=style.LIGHT[2], lw=0, marker="o", ms=4, mec="black", label="traffic light"),
-        Line2D([], [], color=style.OTHER_ELEMENT, lw=0, marker="s", ms=4, mec="black", label="traffic sign"),
+        *traffic_entries(examples),
+        *element_entries(examples),
         *evidence_entries(examples),
         *([] if examples is None else prior_entries(examples)),
     ]
@@ -187,8 +180,7 @@ def add_legend(
     if "segments" in drawn:
         entries += boundary_entries()
     if "areas" in drawn:
-        entries.append(Line2D([], [], color=style.ROAD_BOUNDARY, lw=1, label="road boundary"))
-        entries += [] if "segments" in drawn else [crossing_entry()]
+        entries += area_entries()[: 1 if "segments" in drawn else 2]  # which have an entry for crossings already
     fitting = max(4, int(figure.get_figwidth() // 1.6))
     rows = -(-len(entries) // fitting)
     columns = -(-len(entries) // rows)
@@ -202,11 +194,12 @@ def panel_size(view: PerceptionRange, inches: float = _PANEL_WIDTH) -> tuple[flo
 
 
 def label_edges(axes: np.ndarray) -> None:
-    """Label only the axes along the left and lower edge of the grid."""
-    for ax in axes[-1]:
-        ax.set_xlabel("x, forward [m]", fontsize=8)
-    for ax in axes[:-1].flat:
-        ax.tick_params(labelbottom=False)
+    """Label only the axes along the left and lower edge of the grid; the lowest panel of a column that is not blank."""
+    for column in axes.T:
+        *others, lowest = [ax for ax in column if ax.axison] or [column[-1]]
+        lowest.set_xlabel("x, forward [m]", fontsize=8)
+        for ax in others:
+            ax.tick_params(labelbottom=False)
     for ax in axes[:, 0]:
         ax.set_ylabel("y, left [m]", fontsize=8)
     for ax in axes[:, 1:].flat:

@@ -101,12 +101,23 @@ def save_photo(
 def lanes_drawn(
     photo: UInt8[np.ndarray, "h w 3"], lanes: Iterable[Float[np.ndarray, "p 2"]]
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Return a photo with lanes drawn by OpenCV: for videos, where matplotlib would be slow."""
+    """Return a photo with lanes drawn by OpenCV: for videos, where matplotlib would be slow.
+
+    A lane has gaps where points are NaN, as in the pictures of `draw_lanes`.
+    """
     cv2, drawn = opencv(), np.ascontiguousarray(photo).copy()
     width = max(2, round(photo.shape[1] / 300))
     for lane, colour in zip(lanes, itertools.cycle(LANE_COLOURS), strict=False):
-        cv2.polylines(drawn, [np.round(lane).astype(np.int32)], False, style.rgb(colour), width, cv2.LINE_AA)
+        parts = [np.round(part).astype(np.int32) for part in _finite_parts(lane)]
+        cv2.polylines(drawn, parts, False, style.rgb(colour), width, cv2.LINE_AA)
     return drawn
+
+
+def _finite_parts(lane: Float[np.ndarray, "p 2"]) -> list[np.ndarray]:
+    """Return the pieces of a line between points that are not finite."""
+    known = np.flatnonzero(np.isfinite(lane).all(-1))
+    pieces = np.split(known, np.flatnonzero(np.diff(known) > 1) + 1)
+    return [lane[piece] for piece in pieces if len(piece)]
 
 
 def predicted_lines(prediction: CurvePrediction, threshold: float | None = None) -> Float[np.ndarray, "l p 2"]:

@@ -83,9 +83,39 @@ def crossing_entry() -> Patch:
     return Patch(facecolor=style.CROSSING + "38", edgecolor=style.CROSSING, label="crossing")
 
 
+def area_entries() -> list:
+    """Return the entries of a legend for road boundaries and crossings."""
+    from matplotlib.lines import Line2D
+
+    return [Line2D([], [], color=style.ROAD_BOUNDARY, lw=1, label="road boundary"), crossing_entry()]
+
+
+def traffic_entries(examples: Example | None = None) -> list:
+    """Return the entries of a legend for road users by class, if examples have them; None: as if they had."""
+    from matplotlib.patches import Patch
+
+    if examples is not None and examples.traffic_flow is None:
+        return []
+    users = [Patch(facecolor=colour, label=user.name.lower()) for user, colour in style.ROAD_USER.items()]
+    return [*users, Patch(facecolor="none", edgecolor=style.OTHER_ELEMENT, label="road user not seen")]
+
+
+def element_entries(examples: Example | None = None) -> list:
+    """Return the entries of a legend for traffic lights and signs, if examples have them; None: as if they had."""
+    from matplotlib.lines import Line2D
+
+    if examples is not None and examples.traffic_elements is None:
+        return []
+    return [
+        Line2D([], [], color=style.LIGHT[2], lw=0, marker="o", ms=4, mec="black", label="traffic light"),
+        Line2D([], [], color=style.OTHER_ELEMENT, lw=0, marker="s", ms=4, mec="black", label="traffic sign"),
+    ]
+
+
 def above_entries(lanes: LanePrediction | None, examples: Example) -> list:
     """Return the entries of a legend for the view from above, beside camera images that explain the rest."""
     if lanes is None:
-        lanes_seen = [] if examples.map_lines is not None else visibility_entries()
-        return [*hidden_entries(examples), *lanes_seen, *prior_entries(examples)]
+        truth = [] if examples.map_lines is not None else [*visibility_entries(), *area_entries()]
+        given = [*traffic_entries(examples), *prior_entries(examples), *element_entries(examples)]
+        return [*hidden_entries(examples), *truth, *given]
     return [] if isinstance(lanes, LinePrediction) else [truth_entry(), *prediction_entries()]

@@ -196,7 +196,7 @@ def _draw_panel(
         look = {"marker": "o", "markevery": alone.tolist()} if alone.any() else {}
         ax.plot(steps, mean, **styles[name], **look, lw=1.4, label=name)
         if values.shape[1] > 1:
-            ax.fill_between(steps, *_bounds(values, known), color=styles[name]["color"], alpha=0.2, lw=0)
+            ax.fill_between(steps, *_bounds(values, known), color=styles[name]["color"], alpha=0.2, lw=0.8)
     seen = np.concatenate([values.reshape(-1) for _, values in series.values()])
     seen = seen[np.isfinite(seen)]
     if log and len(seen) and seen.min() > 0.0 and seen.max() > 30.0 * seen.min():

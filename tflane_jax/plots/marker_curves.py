@@ -37,6 +37,7 @@ def save_error_curves(path: Path, curves: dict[str, list[dict[str, Any]]], sigma
         "forward m": PAPER_FORWARD * far / PAPER_DISTANCE,
         "rotation median": PAPER_ANGLE * far / PAPER_DISTANCE,
     }
+    assumed = f"the paper's assumption (found: sigma_d = {sigma_d:g} m)"
     for ax, (key, title, label) in zip(axes.flat, panels, strict=True):
         for number, (name, rows) in enumerate(curves.items()):
             # Boards found at one scale are the same for all corner methods: a later curve must not hide an earlier one.
@@ -44,7 +45,7 @@ def save_error_curves(path: Path, curves: dict[str, list[dict[str, Any]]], sigma
             look = style.curve_style(number) | {"linestyle": line, "marker": marker}
             ax.plot([row["distance m"] for row in rows], [row[key] for row in rows], **look, ms=4, lw=1.3, label=name)
         if key in paper:
-            ax.plot(far, paper[key], color="#777777", lw=3.0, alpha=0.5, label="the paper's assumption", zorder=1.0)
+            ax.plot(far, paper[key], color="#777777", lw=3.0, alpha=0.5, label=assumed, zorder=1.0)
         ax.set_title(title, fontsize=9, loc="left")
         ax.set_ylabel(label, fontsize=8)
         ax.set_xlim(0.0, None)

@@ -12,7 +12,11 @@ def test_the_picture_is_written_and_names_the_assumption(tmp_path, monkeypatch):
     drawn, savefig = [], figure.savefig
     monkeypatch.setattr(figure, "savefig", lambda self, *a, **k: (drawn.append(self), savefig(self, *a, **k)))
     rows = summarise([Sighting(0, 0.0, 10.0, True, 50.0, np.ones(3), 1.0, 30.0, 0.1, 0.2)])
-    path = save_error_curves(tmp_path / "curves.png", {"one": rows, "none": []}, 40.0)
+    path = save_error_curves(
+        tmp_path / "curves.png", {"one": rows, "none": []} | {f"subpixel, scale {i}": rows for i in range(3)}, 40.0
+    )
     assert path.stat().st_size > 1000
-    names = [text.get_text() for text in drawn[0].legends[0].get_texts()]
-    assert names == ["one", "none", "the paper's assumption (found: sigma_d = 40 m)"]
+    (legend,) = drawn[0].legends
+    names = [text.get_text() for text in legend.get_texts()]
+    assert (names[:2], names[-1]) == (["one", "none"], "the paper's assumption (found: sigma_d = 40 m)")
+    assert legend.get_window_extent().width < drawn[0].bbox.width

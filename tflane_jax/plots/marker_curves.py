@@ -55,6 +55,6 @@ def save_error_curves(path: Path, curves: dict[str, list[dict[str, Any]]], sigma
     for ax in axes[-1]:
         ax.set_xlabel("distance [m]", fontsize=8)
     figure.legend(
-        handles=axes[0, 0].lines, loc="outside lower center", ncols=len(curves) + 1, fontsize=8, frameon=False
+        handles=axes[0, 0].lines, loc="outside lower center", ncols=min(len(curves) + 1, 3), fontsize=8, frameon=False
     )
     return save_figure(figure, path)

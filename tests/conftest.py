@@ -6,6 +6,7 @@ import functools
 import gc
 import os
 import shutil
+import signal
 import sys
 import tempfile
 from pathlib import Path
@@ -69,6 +70,14 @@ def _programs_in_memory():
         if pages * os.sysconf("SC_PAGE_SIZE") > 3 * 2**30:
             jax.clear_caches()
             gc.collect()
+
+
+@pytest.fixture
+def interruptible():
+    """Python's own Ctrl-C, also where the tests were started in the background, which ignores it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
 
 
 def pytest_collection_modifyitems(items):

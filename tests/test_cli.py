@@ -4,6 +4,7 @@ import json
 import os
 import re
 import shutil
+import signal
 import subprocess
 import sys
 
@@ -200,6 +201,29 @@ def test_several_seeds_are_evaluated_with_mean_and_deviation(config, tmp_path):
     np.testing.assert_allclose(values[2:], [np.mean(values[:2]), np.std(values[:2], ddof=1)])
 
 
+def test_scores_that_cannot_be_printed_are_saved(trained, tmp_path, monkeypatch):
+    def fail(*_):
+        raise UnicodeEncodeError("ascii", "ü", 0, 1, "ordinal not in range(128)")
+
+    monkeypatch.setattr("tflane_jax.commands.evaluate.print", fail, raising=False)
+    with pytest.raises(UnicodeEncodeError):
+        main(["eval", str(trained), "--out", str(tmp_path / "table")])
+    assert json.loads((tmp_path / "table.json").read_text())["rows"]
+
+
+def test_a_damaged_checkpoint_is_told_before_the_data_are_read(trained, tmp_path, monkeypatch, capsys):
+    run = shutil.copytree(trained, tmp_path / "run")
+    array = next(
+        path for path in sorted((run / "checkpoints" / "step_00000004" / "state").rglob("*")) if path.is_file()
+    )
+    array.write_bytes(array.read_bytes()[:-1] + b"?")
+    monkeypatch.setattr("tflane_jax.runs._train", None)
+    assert main(["train", "--resume", "--out", str(run)]) == 2
+    said = capsys.readouterr().err
+    assert "step_00000004 is damaged" in said
+    assert "the run can go on from step 2" in said
+
+
 def test_where_scores_go_is_checked_before_the_evaluation(trained, tmp_path, monkeypatch, capsys):
     """Also where --out is left out: the table was printed, minutes later, and could not be saved."""
     run = shutil.copytree(trained, tmp_path / "run", ignore=shutil.ignore_patterns("evaluations"))
@@ -269,9 +293,8 @@ def test_every_command_has_help(capsys):
         assert capsys.readouterr().out.startswith(f"usage: tflane {command}")
 
 
+@pytest.mark.usefixtures("interruptible")
 def test_ctrl_c_prints_the_command_to_resume(config, tmp_path, capsys, monkeypatch):
-    import signal
-
     from tflane_jax.tasks import lane_graph
 
     def interrupting(*arguments, **options):

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import sys
 
 import jax
 import numpy as np
@@ -94,7 +95,7 @@ def test_resume_is_bit_identical(trained, config, tmp_path):
     jax.tree.map(np.testing.assert_array_equal, again, whole)
 
 
-def test_predictions_are_written_in_tusimple_format(trained, tmp_path, monkeypatch):
+def test_predictions_are_written_in_tusimple_format(trained, tmp_path, monkeypatch, capsys):
     drawn = []
     monkeypatch.setattr("tflane_jax.plots.images.draw_lanes", lambda ax, lanes: drawn.append(len(lanes)))
     out = tmp_path / "predictions"
@@ -107,6 +108,12 @@ def test_predictions_are_written_in_tusimple_format(trained, tmp_path, monkeypat
         metrics.update(found[name], lanes)
     assert metrics.compute()["frames"] == 2
     assert (out / "pictures.png").is_file()
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    assert main(["predict", str(trained), "--count", "1", "--out", str(out)]) == 0
+    said = capsys.readouterr()
+    assert "no pictures, which need matplotlib: " in said.err
+    assert said.out.endswith(f"written to {out}: predictions.json, truth.json\n")
+    assert {path.name for path in out.iterdir()} == {"predictions.json", "truth.json"}
 
 
 @pytest.mark.slow

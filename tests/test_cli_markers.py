@@ -1,6 +1,7 @@
 """`tflane markers`, from the command line to the files that it writes."""
 
 import json
+import sys
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from tests.markers.test_detection import AHEAD, photo, pose
 from tflane_jax.cli import main
 from tflane_jax.commands.markers import _label_place
 from tflane_jax.errors import LeftOutWarning
+from tflane_jax.markers.curves import Sighting
 
 cv2 = pytest.importorskip("cv2")
 
@@ -237,3 +239,16 @@ def test_curves_name_distances_at_which_no_image_has_a_board(tmp_path, capsys):
     assert "no board lies wholly in an image at 1.5 m, left out of the table" in capsys.readouterr().err
     written = json.loads((tmp_path / "out" / "curves-subpixel-0.3.json").read_text())
     assert [(row["distance m"], row["boards"]) for row in written["rows"]] == [(12.0, 3)]  # once, though given twice
+
+
+def test_without_matplotlib_curves_are_tables(tmp_path, monkeypatch, capsys):
+    seen = [Sighting(0, 0.0, 12.0, False, 20.0)]
+    monkeypatch.setattr("tflane_jax.commands.markers.measure", lambda configs: [seen for _ in configs])
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    (tmp_path / "curves.png").touch()  # of an earlier measurement
+    arguments = ["--scales", "0.3", "--corners", "subpixel", "--distances", "12", "--out", str(tmp_path)]
+    assert main(["markers", "curves", *arguments]) == 0
+    said = capsys.readouterr()
+    assert said.err.startswith("no pictures, which need matplotlib: ")
+    assert said.out.endswith(f"written to {tmp_path}\n")
+    assert {path.name for path in tmp_path.iterdir()} == {"curves-subpixel-0.3.md", "curves-subpixel-0.3.json"}

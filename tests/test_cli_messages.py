@@ -80,6 +80,22 @@ def test_a_full_output_is_one_line():
     assert (ended.returncode, ended.stderr) == (2, said)
 
 
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no /dev/full")
+def test_an_error_that_cannot_be_told_keeps_its_exit_code():
+    with open("/dev/full", "w") as full:
+        command = [sys.executable, "-m", "tflane_jax.cli", "cache", "list", ""]
+        ended = subprocess.run(command, stdout=subprocess.PIPE, stderr=full, check=False)
+    assert (ended.returncode, ended.stdout) == (2, b"")
+
+
+def test_characters_that_the_output_lacks_are_escaped(tmp_path):
+    environment = os.environ | {"TFLANE_CACHE": str(tmp_path / "ü"), "PYTHONIOENCODING": "ascii"}
+    command = [sys.executable, "-m", "tflane_jax.cli", "cache", "list"]
+    ended = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
+    assert (ended.returncode, ended.stderr) == (0, "")
+    assert ended.stdout.startswith(f"{tmp_path}/\\xfc: ")
+
+
 @pytest.mark.skipif(os.name != "posix", reason="a shell that closes streams")
 def test_a_closed_output_is_no_error():
     command = f"{shlex.quote(sys.executable)} -m tflane_jax.cli cache list"
@@ -127,6 +143,15 @@ def test_options_are_not_abbreviated(capsys):
             "the model reads 20 past frames (task.model.priors.traffic_flow.prior.frames), and examples hold 10",
         ),
         ("summary --no-compile --config tf_lane/toponet --data FrontViewData", "this configuration's data are"),
+        (
+            "score tusimple pr\udcc3\udcbc.json truth.json",
+            "cannot read 'pr\\udcc3\\udcbc.json': this process reads names in the encoding of its locale, utf-8, and "
+            "the name is UTF-8; set PYTHONUTF8=1",
+        ),
+        (
+            "markers curves --out f\udcc3\udcbcr",
+            "cannot write 'f\\udcc3\\udcbcr': this process reads names in the encoding of its locale",
+        ),
         ("cache list --import ends.py", "module ends.py (--import or TFLANE_IMPORT) cannot be imported: SystemExit: 3"),
     ],
 )

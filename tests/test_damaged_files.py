@@ -329,3 +329,20 @@ def test_run_folders_that_cannot_be_used_are_told_before_any_work(tmp_path, caps
     with run_folder.claimed(tmp_path / "used", "new"):
         assert main(["train", "--config", "tf_lane/toponet", "--out", str(tmp_path / "used")]) == 2
     assert f"another process is training into {tmp_path / 'used'}" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("content", "wrong", "left"),
+    [
+        ("[{", "it is no JSON", 0),
+        ("{}", "it holds no list of starts", 0),
+        ('[3, {"git": null}]', "1 start of 2 cannot be read", 1),
+    ],
+)
+def test_a_damaged_provenance_is_told_and_kept(run, content, wrong, left):
+    (run / "provenance.json").write_text(content)
+    (notice, *_) = provenance.add_provenance(run)
+    assert notice.startswith(f"{run / 'provenance.json'} is damaged: {wrong}; it is kept as provenance.damaged.json")
+    assert (run / "provenance.damaged.json").read_text() == content
+    assert len(provenance.read_provenance(run)) == left + 1
+    assert provenance.add_provenance(run) == []

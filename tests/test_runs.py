@@ -99,7 +99,7 @@ def test_folders_may_be_named_by_text(config, tmp_path):
 
 def test_a_run_is_drawn_at_every_evaluation_or_at_its_end(config, tmp_path, monkeypatch):
     drawn = []
-    monkeypatch.setattr("tflane_jax.plots.save_curves", lambda path, records: drawn.append(records[-1]["step"]))
+    monkeypatch.setattr("tflane_jax.runs.save_curves", lambda path, records: drawn.append(records[-1]["step"]))
     for when in ("evaluations", "end"):
         train_run(config, tmp_path / when, progress=False, drawn=when)
     assert drawn == [2, 4, 4]

@@ -68,14 +68,6 @@ def test_another_thread_gives_its_result_or_its_error():
         in_another_thread(lambda: 1 // 0)
 
 
-@pytest.fixture
-def interruptible():
-    """Python's own Ctrl-C, also where the tests were started in the background, which ignores it."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
-
-
 @pytest.mark.usefixtures("interruptible")
 def test_a_signal_ends_the_wait_and_not_the_work():
     release, ended = threading.Event(), threading.Event()

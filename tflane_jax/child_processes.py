@@ -8,6 +8,7 @@ import os
 import signal
 import threading
 from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import resource_tracker
 
 
@@ -26,6 +27,13 @@ def spared_interrupts() -> Iterator[None]:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def end_workers(pool: ProcessPoolExecutor) -> None:
+    """End the processes of a pool at once and wait until they are gone; `shutdown` alone waits for running tasks."""
+    for process in list((pool._processes or {}).values()):  # `terminate_workers` (Python 3.14) does not wait
+        process.terminate()
+    pool.shutdown(cancel_futures=True)
 
 
 def end_with_parent() -> None:

@@ -20,7 +20,7 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import Any, TextIO
 
 from tflane_jax.commands.arguments import comparisons, data, markers, models
 from tflane_jax.commands.arguments.shared import CommandParser
@@ -38,6 +38,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     _open_closed()
     keep_freed_memory()
     if arguments is None:  # the program itself
+        _escape_unprintable()
         warnings.showwarning = OneLineWarnings(warnings.showwarning)
     with _ending_on_sigterm(), _signals_not_lost():
         code = exit_code(lambda: _run(sys.argv[1:] if arguments is None else arguments))
@@ -51,6 +52,13 @@ def _open_closed() -> None:
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115 (open until the end)
+
+
+def _escape_unprintable() -> None:
+    """Print characters that the encoding of standard output lacks as escapes, as standard error does."""
+    reconfigure = getattr(sys.stdout, "reconfigure", None)
+    if reconfigure is not None and sys.stdout.errors == "strict":
+        reconfigure(errors="backslashreplace")
 
 
 def _run(arguments: Sequence[str]) -> int:
@@ -86,45 +94,53 @@ def exit_code(run: Callable[[], int]) -> int:
     try:
         return run()
     except UserError as error:
-        print(f"tflane: {error}", file=sys.stderr)
+        _tell(f"tflane: {error}")
         return 2
     except ModuleNotFoundError as error:
         if (told := not_installed(error)) is None:
             raise
-        print(f"tflane: {told}", file=sys.stderr)
+        _tell(f"tflane: {told}")
         return 2
     except KeyboardInterrupt as error:
-        print("tflane: stopped", file=sys.stderr)
+        _tell("tflane: stopped")
         return 128 + getattr(error, "number", signal.SIGINT)
     except MemoryError as error:
-        print(f"tflane: memory is full: {error or 'ask for less at a time'}", file=sys.stderr)
+        _tell(f"tflane: memory is full: {error or 'ask for less at a time'}")
         return 2
     except BrokenPipeError:  # `tflane ... | head`
-        _drop_output()
+        _drop_output(sys.stdout)
         return 128 + signal.SIGPIPE
     except RuntimeError as error:
         # By name, because importing JAX is slow. Other libraries say the same of a full disk.
         if type(error).__name__ != "JaxRuntimeError" or "RESOURCE_EXHAUSTED" not in str(error):
             raise
         remedies = "a smaller training.batch_size or evaluation.batch_size, training.accumulate, precision or remat"
-        print(f"tflane: the memory of the device is full: {remedies} (docs/scale.md)", file=sys.stderr)
+        _tell(f"tflane: the memory of the device is full: {remedies} (docs/scale.md)")
         return 2
     except OSError as error:
         if error.filename is None and error.errno in _FULL:
-            print(f"tflane: cannot print: {error.strerror}; make room or print elsewhere", file=sys.stderr)
-            _drop_output()
+            _tell(f"tflane: cannot print: {error.strerror}; make room or print elsewhere")
+            _drop_output(sys.stdout)
             return 2
         # pathlib raises these wherever it looks for such a file
         if error.filename is None or error.errno not in (errno.ENAMETOOLONG, errno.EACCES, errno.EPERM):
             raise
         remedy = "" if error.errno == errno.ENAMETOOLONG else ": give yourself the right, or choose another path"
-        print(f"tflane: {error.filename}: {error.strerror}{remedy}", file=sys.stderr)
+        _tell(f"tflane: {error.filename}: {error.strerror}{remedy}")
         return 2
 
 
-def _drop_output() -> None:
-    """Print nothing more: what is left would fail again when the process ends."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+def _tell(text: str) -> None:
+    """Print a line on standard error; where that cannot be written, the exit code alone tells of the error."""
+    try:
+        print(text, file=sys.stderr)
+    except OSError:
+        _drop_output(sys.stderr)
+
+
+def _drop_output(stream: TextIO) -> None:
+    """Print nothing more there: what is left would fail again when the process ends."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 class OneLineWarnings:
@@ -138,7 +154,7 @@ class OneLineWarnings:
             self._show(message, category, *place, **named)
         elif str(message) not in self._shown:
             self._shown.add(str(message))
-            print(f"tflane: warning: {message}", file=sys.stderr)
+            _tell(f"tflane: warning: {message}")
 
 
 @contextlib.contextmanager

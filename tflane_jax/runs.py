@@ -6,7 +6,6 @@ The Python interface behind `tflane train`, `eval` and `predict`, also for noteb
 from __future__ import annotations
 
 import contextlib
-import importlib.util
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -23,13 +22,15 @@ from tflane_jax.datasets.batches import in_workers
 from tflane_jax.datasets.data_source import loading_of
 from tflane_jax.datasets.sources import check_labelled, source_of
 from tflane_jax.devices import training_mesh
-from tflane_jax.errors import UserError, install
+from tflane_jax.errors import UserError
 from tflane_jax.evaluation.results import in_all_versions
 from tflane_jax.files.atomic import write_json, write_text
 from tflane_jax.limits import check_settings
 from tflane_jax.migrations import migrate
 from tflane_jax.models.parameters import Params
 from tflane_jax.own_modules import own_code
+from tflane_jax.plots import save_curves
+from tflane_jax.plots.figure import can_draw
 from tflane_jax.processes import agreed, from_first, is_first
 from tflane_jax.run_checks import agree_on_settings, check_model, check_origin_model, check_rate_factors, check_run
 from tflane_jax.startup import showing, stage
@@ -39,6 +40,7 @@ from tflane_jax.training.loop import Draw, TrainingResult, train
 from tflane_jax.training.manifest import Manifest
 from tflane_jax.training.provenance import add_provenance
 from tflane_jax.training.records import Record, by_name
+from tflane_jax.training.resumption import check_resumable
 from tflane_jax.training.run_folder import Start, check_start, check_unchanged, claimed, read_config, unused_changes
 from tflane_jax.training.schedule import make_optimizer, scaled_to_batch
 from tflane_jax.training.state import per_seed, state_of
@@ -97,6 +99,7 @@ def train_run(
         check_rate_factors(config)
     if start == "resume":
         from_first(lambda: check_unchanged(folder, to_json(config), current_form))
+        from_first(lambda: check_resumable(Checkpoints(folder / "checkpoints")))
     else:
         from_first(lambda: check_origin(config, replaced=folder if start == "overwrite" else None))
         from_first(lambda: check_origin_model(config))
@@ -332,11 +335,8 @@ def _drawing(config: RunConfig, drawn: Drawn) -> Draw | None:
 
     See `train_run` for `drawn`.
     """
-    if importlib.util.find_spec("matplotlib") is None:
-        print(f"no pictures, which need matplotlib: {install('plot')}", file=sys.stderr)
+    if not can_draw():
         return None
-    from tflane_jax.plots import save_curves
-
     draw_examples = config.task.drawing(config.data, config.evaluation)
 
     def draw(folder: Path, step: int, params: Params, records: list[Record]) -> None:

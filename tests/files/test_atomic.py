@@ -15,7 +15,15 @@ import pytest
 
 from tflane_jax.errors import UserError
 from tflane_jax.files import atomic
-from tflane_jax.files.atomic import check_stem, is_temporary, replacing, write_bytes, write_json, write_text
+from tflane_jax.files.atomic import (
+    check_stem,
+    delete_older,
+    is_temporary,
+    replacing,
+    write_bytes,
+    write_json,
+    write_text,
+)
 
 
 def names(folder):
@@ -241,3 +249,13 @@ def test_the_files_of_a_stem_are_checked_before_they_are_made(tmp_path):
     (tmp_path / "table.json").mkdir()
     with pytest.raises(UserError, match=r"cannot write .*table\.json: it is a folder"):
         check_stem(tmp_path / "table")
+
+
+def test_files_of_an_earlier_result_are_deleted(tmp_path):
+    for name in ("old.png", "other.png"):
+        (tmp_path / name).touch()
+    (tmp_path / "folder").mkdir()
+    delete_older(tmp_path, "old.png", "none.png")
+    assert names(tmp_path) == ["folder", "other.png"]
+    with pytest.raises(UserError, match=r"cannot delete .*folder: .*; it belongs to an earlier result"):
+        delete_older(tmp_path, "folder")

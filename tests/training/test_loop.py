@@ -130,6 +130,7 @@ def test_an_evaluation_that_is_made_again_is_recorded_once(whole, tmp_path, monk
     assert timeless(tmp_path / "run") == timeless(whole)
 
 
+@pytest.mark.usefixtures("interruptible")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_finishes_the_step_and_saves_it(whole, tmp_path, number):
     def evaluate_and_signal(params):

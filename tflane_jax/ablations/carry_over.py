@@ -195,7 +195,7 @@ def _save(
     rows = compact({row: [by_log[log] for log in logs] for row, by_log in found.items()}, columns)
     title = f"{note}{protocol}; logs that were never seen, percent (mean ± std over {len(logs)} logs){ending}"
     path, _ = save_table(out / "carry_over", rows, meta, title=title)
-    print("\n" + format_table(rows, title=title))
+    table = format_table(rows, title=title)
     each: list[dict[str, Any]] = [
         {"log": log, "model": row} | {key: 100.0 * found[row][log][key] for key in columns}
         for log in logs
@@ -208,7 +208,7 @@ def _save(
     once = _ONE_TRAINING if counts == [1] else ""
     title = " ".join(filter(None, [note.strip(), declared.sentence(), interim, paired, once, FITTED]))
     save_table(out / "effects", tests, meta, title=title, digits=4)
-    print("\n" + format_table(tests, title=title, digits=4))
+    print(f"\n{table}\n\n{format_table(tests, title=title, digits=4)}")
     return path
 
 

@@ -47,9 +47,10 @@ def save_effects(
         if no_drives:
             lines.append(f"Remark: {no_drives}: the intervals are too narrow.")
     rows, title = _rows(results, declared.declaration, test, tested), "\n".join(lines)
-    print("\n" + format_table(rows, title=title, digits=4))
     meta = {"declaration": asdict(declared), "protocol": results.protocol(test), "seeds": list(seeds)}
-    return save_table(stem, rows, meta, title=title, digits=4)[0]
+    path, _ = save_table(stem, rows, meta, title=title, digits=4)
+    print("\n" + format_table(rows, title=title, digits=4))
+    return path
 
 
 def findings(tested: Tested) -> list[str]:

@@ -75,9 +75,10 @@ def _save_table(
         title += f"; no run of {', '.join(missing)} is complete"
     title = _with_warning(title, results, test)
     rows += task.quoted()
-    print("\n" + format_table(rows, title=title))
     meta = {"protocol": results.protocol(test), "seeds": list(results.seeds), "test": list(results.tests.get(test, ()))}
-    return save_table(stem, rows, meta, title=title)[0]
+    written = save_table(stem, rows, meta, title=title)[0]
+    print("\n" + format_table(rows, title=title))
+    return written
 
 
 def _save_paired(results: Results, test: str, metrics: Sequence[str], task: Task, stem: Path) -> list[Path]:
@@ -104,8 +105,10 @@ def _save_paired(results: Results, test: str, metrics: Sequence[str], task: Task
     over = "the seeds that both have" if any("seeds" in row for row in rows) else counted(len(results.seeds), "seed")
     title = f"{results.protocol(test)}, {results.title(test)}: paired differences to {control}, two-sided t-test "
     title = _with_warning(f"{title}over {over}; p (Holm) is corrected for all tests of one checkpoint", results, test)
+    meta = {"protocol": results.protocol(test), "seeds": seeds}
+    written = save_table(stem, rows, meta, title=title, digits=4)[0]
     print("\n" + format_table(rows, title=title, digits=4))
-    return [save_table(stem, rows, {"protocol": results.protocol(test), "seeds": seeds}, title=title, digits=4)[0]]
+    return [written]
 
 
 def _with_warning(title: str, results: Results, test: str) -> str:

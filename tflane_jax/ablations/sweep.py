@@ -104,9 +104,9 @@ def sweep(
         title += f"; {counted(unfinished, 'run')} not finished"
     if mixed := mixed_protocols(by_model):
         title += f"\n\n{mixed}"
-    print("\n" + format_table(rows, title=title))
     meta = {"protocol": protocol, "checkpoint": which, "setting": setting, "values": list(values), "scores": scores}
     written = list(save_table(out / "sweep", rows, meta, title=title))
+    print("\n" + format_table(rows, title=title))
     if importlib.util.find_spec("matplotlib") is not None:
         from tflane_jax.plots.sweep import save_sweep
 

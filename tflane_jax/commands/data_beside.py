@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import importlib.util
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -67,11 +68,13 @@ def beside(config: RunConfig, options: argparse.Namespace) -> int:
         for quantity in dict.fromkeys(q for found in values.values() for q in found)
     ]
     title = "mean (10 % to 90 %) over frames, and over lanes from `length` on"
-    print(format_table(rows, title=title))
+    paths: list[Path] = []
     if options.out is not None:
-        paths = list(save_table(options.out, rows, {"values": _summary(values)}, title=title))
+        paths += save_table(options.out, rows, {"values": _summary(values)}, title=title)
         if importlib.util.find_spec("matplotlib") is not None:
             paths.append(save_distributions(options.out.with_name(f"{options.out.name}.png"), values))
+    print(format_table(rows, title=title))
+    if paths:
         print(f"\n{written_to(paths)}")
     return 0
 

@@ -60,12 +60,6 @@ def run(options: argparse.Namespace) -> int:
     check_table(stem)
     protocol, rows = evaluate_run(trained, source, task=task, frame_groups=groups)
     title = f"{trained.name}, {name}: {protocol}"
-    print(format_table(rows, title=title))
-    counts = [row[kind] for row in rows for kind in ("lanes", "lines") if kind in row]
-    if counts and not any(counts):
-        print(f"tflane: warning: {name} has no true lane: scores are those of an empty truth", file=sys.stderr)
-    if near is not None:
-        print(f"\n{near.sentence()}")
     meta = {
         "run": trained.name,
         "step": trained.step,
@@ -76,7 +70,14 @@ def run(options: argparse.Namespace) -> int:
         "source": to_json(source),
         "near_training": None if near is None else near.sentence(),
     }
-    paths = [*save_table(stem, rows, meta, title=title), *_save_edge_types(trained, source, stem)]
+    paths = list(save_table(stem, rows, meta, title=title))  # before anything is printed, which may fail
+    print(format_table(rows, title=title))
+    counts = [row[kind] for row in rows for kind in ("lanes", "lines") if kind in row]
+    if counts and not any(counts):
+        print(f"tflane: warning: {name} has no true lane: scores are those of an empty truth", file=sys.stderr)
+    if near is not None:
+        print(f"\n{near.sentence()}")
+    paths += _save_edge_types(trained, source, stem)
     if options.errors:
         paths += _save_errors(trained, task or trained.config.task, source, stem, meta)
     print(f"\n{written_to(paths)}")
@@ -100,8 +101,9 @@ def _save_errors(run: Run, task: Any, source: Any, stem: Path, meta: dict[str, A
             fractions = {outcome: 100.0 * number / every if every else 0.0 for outcome, number in counts.items()}
             rows.append({"of": name, "seed": seed, "number": every, "confidence": confidence} | fractions)
     title = "why lanes are not found, percent; detections with at least the confidence of the best F-score"
+    paths = list(save_table(stem.with_name(f"{stem.name}-errors"), rows, meta, title=title))
     print(f"\n{format_table(rows, title=title)}")
-    return [*save_table(stem.with_name(f"{stem.name}-errors"), rows, meta, title=title)]
+    return paths
 
 
 def _save_edge_types(run: Run, source: Any, stem: Path) -> list[Path]:

@@ -29,7 +29,7 @@ from jaxtyping import Float, UInt8
 from tflane_jax.commands.sources import make_folder
 from tflane_jax.datasets.plausible import LARGEST_DISTORTION, MOST_PIXELS
 from tflane_jax.errors import LeftOutWarning, UserError
-from tflane_jax.files.atomic import check_folder, check_replaces, write_bytes, write_json
+from tflane_jax.files.atomic import check_folder, check_replaces, delete_older, write_bytes, write_json
 from tflane_jax.files.images import check_centre, list_photos, opencv, read_image, undistorted
 from tflane_jax.files.wording import check_name, counted, plain_name, short_stem
 from tflane_jax.geometry.cameras import project
@@ -39,6 +39,7 @@ from tflane_jax.markers.detection import DetectedMarkers, detect
 from tflane_jax.markers.image_search import DetectorConfig
 from tflane_jax.markers.square_pose import marker_outline
 from tflane_jax.plots import format_table, save_table, style
+from tflane_jax.plots.figure import can_draw
 from tflane_jax.plots.marker_curves import save_error_curves
 from tflane_jax.plots.marker_drive import OUTCOMES
 from tflane_jax.scene import CameraViews
@@ -127,7 +128,7 @@ def find(options: argparse.Namespace) -> int:
 
 
 def curves(options: argparse.Namespace) -> int:
-    """Measure detection rate and pose error over distance; write tables and a picture."""
+    """Measure detection rate and pose error over distance; write tables and, with matplotlib, a picture."""
     if min(options.scales) <= 0.0:
         raise UserError(f"--scales are positive fractions of the native image size, not {min(options.scales):g}")
     if not 0.0 < options.sigma_d < np.inf:
@@ -148,7 +149,10 @@ def curves(options: argparse.Namespace) -> int:
             meta = {"config": str(config), "boards": [vars(sighting) for sighting in sightings]}
             save_table(stem, drawn[name], meta, title=name)
             print(format_table(drawn[name], title=name) + "\n")
-    print("written to", save_error_curves(options.out / "curves.png", drawn, options.sigma_d))
+    delete_older(options.out, "curves.png")
+    if can_draw():
+        save_error_curves(options.out / "curves.png", drawn, options.sigma_d)
+    print(f"written to {options.out}")
     return 0
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import json
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -17,9 +18,10 @@ from tflane_jax.commands.predict_lanes import MOST_DRAWN
 from tflane_jax.commands.sources import chosen_source, make_folder, model_title
 from tflane_jax.datasets import sources
 from tflane_jax.errors import UserError
-from tflane_jax.files.atomic import write_text
+from tflane_jax.files.atomic import delete_older, write_text
 from tflane_jax.files.tusimple import RowLanes
 from tflane_jax.files.wording import counted
+from tflane_jax.plots.figure import can_draw
 from tflane_jax.plots.images import save_road_images
 from tflane_jax.runs import Run
 from tflane_jax.scene import stack_examples
@@ -47,19 +49,25 @@ def predict_split(trained: Run, options: argparse.Namespace) -> int:
         name = dataset.info(index).scene
         truths.append({"raw_file": name, "lanes": _plain(truth), "h_samples": np.asarray(truth.rows).tolist()})
         predictions.append({"raw_file": name, "lanes": _plain(found), "run_time": 0.0})
-    for name, rows in (("predictions.json", predictions), ("truth.json", truths)):
-        write_text(options.out / name, "".join(json.dumps(row) + "\n" for row in rows))
-    title, rows = model_title(trained), spread(len(indices), MOST_DRAWN)
-    examples, answers = jax.tree.map(lambda leaf: np.asarray(leaf)[rows], (examples, answers))
-    names = [dataset.info(indices[row]).scene for row in rows]
-    pictures = options.out / "pictures.png"
-    save_road_images(pictures, examples, {title: answers}, titles=names, threshold=options.threshold)
+    write_text(options.out / "predictions.json", _rows(predictions))
+    delete_older(options.out, "truth.json", "pictures.png")  # the disk may fill up
+    write_text(options.out / "truth.json", _rows(truths))
+    if drawn := can_draw():
+        title, rows = model_title(trained), spread(len(indices), MOST_DRAWN)
+        examples, answers = jax.tree.map(lambda leaf: np.asarray(leaf)[rows], (examples, answers))
+        names = [dataset.info(indices[row]).scene for row in rows]
+        pictures = options.out / "pictures.png"
+        save_road_images(pictures, examples, {title: answers}, titles=names, threshold=options.threshold)
     lines = sum(len(row["lanes"]) for row in predictions)
     found = f"{counted(len(indices), 'image')}, {counted(lines, 'lane line')} with a score of at least"
     hint = "" if lines else " (choose a lower --threshold to see more)"
-    files = "predictions.json, truth.json, pictures.png"
+    files = "predictions.json, truth.json" + ", pictures.png" * drawn
     print(f"{found} {options.threshold:g}{hint}; written to {options.out}: {files}")
     return 0
+
+
+def _rows(records: list[dict[str, Any]]) -> str:
+    return "".join(json.dumps(record) + "\n" for record in records)
 
 
 def _plain(lanes: RowLanes) -> list[list[float]]:

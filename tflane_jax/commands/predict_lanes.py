@@ -45,10 +45,11 @@ from tflane_jax.errors import UserError
 from tflane_jax.evaluation.geometric_topology import Topology, edge_confidences
 from tflane_jax.evaluation.interventions import dataset_with_traffic
 from tflane_jax.evaluation.predict import predict_examples
-from tflane_jax.files.atomic import write_json
+from tflane_jax.files.atomic import delete_older, write_json
 from tflane_jax.files.npz import write_npz
 from tflane_jax.files.wording import counted
 from tflane_jax.plots import save_camera_views, save_examples
+from tflane_jax.plots.figure import can_draw
 from tflane_jax.plots.segments import true_lanes
 from tflane_jax.runs import Run
 from tflane_jax.scene import Example, LanePrediction, LinePrediction, Prediction
@@ -86,6 +87,7 @@ def predict(trained: Run, options: argparse.Namespace) -> int:
 
     make_folder(options.out)
     write_npz(options.out / "predictions.npz", arrays)
+    delete_older(options.out, "truth.npz", "predictions.json", "pictures.png", "cameras.png")  # the disk may fill up
     truth = _truth(examples, answer.lanes, arrays)
     if truth is not None:
         write_npz(options.out / "truth.npz", truth | {name: arrays[name] for name in ("scene", "timestamp_ns")})
@@ -122,7 +124,12 @@ def _draw(
     answer: Prediction,
     label: str,
 ) -> list[str]:
-    """Draw some of the frames, and the camera views of those that have images; return the names of the files."""
+    """Draw some of the frames, and the camera views of those that have images; return the names of the files.
+
+    Without matplotlib there are none, and a line tells.
+    """
+    if not can_draw():
+        return []
     rows = spread(len(indices), MOST_DRAWN)
     drawn = [indices[row] for row in rows]
     examples, lanes, elements = jax.tree.map(

@@ -55,7 +55,6 @@ def run(options: argparse.Namespace) -> int:
     # What the scores of a part rest on.
     counted = () if options.by is None else _COUNTED
     shown = [name for name in ("part", *protocol.columns, *counted, "frames") if any(name in row for row in rows)]
-    print(format_table(rows, shown, title=title, digits=4))
     meta = {
         "protocol": scored.protocol,
         "predictions": str(options.predictions),
@@ -65,6 +64,7 @@ def run(options: argparse.Namespace) -> int:
         "remarks": remarks,
     }
     paths = save_table(options.out, rows, meta, columns=shown, title=title, digits=4)
+    print(format_table(rows, shown, title=title, digits=4))
     print(f"\n{written_to(paths)}")
     return 0
 

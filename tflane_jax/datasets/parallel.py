@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tflane_jax.child_processes import end_with_parent, spared_interrupts
+from tflane_jax.child_processes import end_with_parent, end_workers, spared_interrupts
 from tflane_jax.datasets.base import IndexedExamples, made
 from tflane_jax.datasets.leaves import check_form, example_leaves
 from tflane_jax.errors import UserError
@@ -144,6 +144,9 @@ def _run(job: _Job, blocks: list[range], workers: int) -> Iterator[tuple[range, 
                 "a worker process that builds the dataset died: either memory ran out (use fewer workers), or a "
                 'script started the build outside `if __name__ == "__main__":` (workers import the script)'
             ) from error
+        except BaseException:
+            end_workers(pool)  # a block may run for half a minute
+            raise
         finally:
             pool.shutdown(wait=True, cancel_futures=True)
 

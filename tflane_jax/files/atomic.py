@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from tflane_jax.errors import UserError
+from tflane_jax.files.wording import no_utf8
 
 _TEMPORARY = re.compile(r"\..+\.\d+-[\da-f]+\.tmp(\.\w+)?")
 _FULL = (errno.ENOSPC, errno.EDQUOT)
@@ -57,6 +58,19 @@ def replacing(path: Path | str) -> Iterator[Path]:
         raise UserError(_message(path, temporary, error)) from error
     finally:
         _delete(temporary)
+
+
+def delete_older(folder: Path, *names: str) -> None:
+    """Delete files of an earlier result, if they are there, so that none is left beside those of a new one.
+
+    Raises UserError where one cannot be deleted.
+    """
+    for path in (folder / name for name in names):
+        try:
+            path.unlink(missing_ok=True)
+        except OSError as error:
+            cause = error.strerror or str(error)
+            raise UserError(f"cannot delete {path}: {cause}; it belongs to an earlier result") from error
 
 
 def write_bytes(path: Path | str, content: bytes | bytearray) -> Path:
@@ -154,7 +168,7 @@ def _check_place(path: Path, probe: Path, above: Sequence[Path]) -> None:
     except (FileNotFoundError, NotADirectoryError):
         pass
     except UnicodeEncodeError:  # libraries and JSON take no other names
-        raise UserError(f"cannot write {str(path)!a}: the name is not UTF-8; choose another path") from None
+        raise UserError(f"cannot write {str(path)!a}: {no_utf8(path, 'choose another path')}") from None
     except OSError as error:  # such as a name that is too long
         raise UserError(_message(path, probe, error)) from None
     found = next(folder for folder in above if os.path.lexists(folder))

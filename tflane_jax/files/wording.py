@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import reprlib
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -35,7 +36,22 @@ def check_name(path: Path) -> None:
     try:
         str(path).encode()
     except UnicodeEncodeError:
-        raise UserError(f"cannot read {str(path)!a}: the name is not UTF-8; rename the file") from None
+        raise UserError(f"cannot read {str(path)!a}: {no_utf8(path, 'rename the file')}") from None
+
+
+def no_utf8(path: Path, remedy: str) -> str:
+    """Return why a name cannot be encoded as UTF-8: it is not, then with the remedy, or this process read it wrongly.
+
+    Without a UTF-8 locale, Python reads every byte that is not ASCII as a surrogate, also those of a UTF-8 name.
+    """
+    try:
+        os.fsencode(path).decode()
+    except UnicodeError:
+        return f"the name is not UTF-8; {remedy}"
+    return (
+        f"this process reads names in the encoding of its locale, {sys.getfilesystemencoding()}, and the name is "
+        "UTF-8; set PYTHONUTF8=1 or a UTF-8 locale (LC_ALL=C.UTF-8)"
+    )
 
 
 def plain_name(path: Path) -> str:

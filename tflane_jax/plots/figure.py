@@ -5,14 +5,16 @@ matplotlib is imported with the first figure, because the import takes a second 
 
 from __future__ import annotations
 
+import importlib.util
 import io
+import sys
 import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tflane_jax.errors import UserError, missing_extra
+from tflane_jax.errors import UserError, install, missing_extra
 from tflane_jax.files.atomic import replacing
 from tflane_jax.plots import style
 
@@ -25,6 +27,14 @@ TITLE = 44
 """Characters of a line above a panel of 3.7 inches, of 9 points."""
 # On a side of a picture: matplotlib's limit.
 _MOST_PIXELS = 2**16
+
+
+def can_draw() -> bool:
+    """Return whether matplotlib is installed; where it is not, say so in a line that names the extra."""
+    if importlib.util.find_spec("matplotlib") is not None:
+        return True
+    print(f"no pictures, which need matplotlib: {install('plot')}", file=sys.stderr)
+    return False
 
 
 def new_figure(

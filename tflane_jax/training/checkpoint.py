@@ -182,16 +182,22 @@ class Checkpoints:
 
     def arrays(self, step: int) -> dict[str, np.ndarray]:
         """Return the saved arrays by path ("ema_params/encoder/kernel"); raises UserError like `manifest`."""
-        folder, manifest = self.path(step), self.manifest(step)
+        self.check(step)
         try:
-            if (found := _checksums(folder)) != manifest.files:
-                wrong = sorted(k for k in found.keys() | manifest.files.keys() if found.get(k) != manifest.files.get(k))
-                raise self._damaged(step, f"{wrong[0]} is not what was written")
-            return load_arrays(folder / "state")
-        except UserError:
-            raise
+            return load_arrays(self.path(step) / "state")
         except Exception as error:  # orbax and tensorstore have many
             raise self._unreadable(step, error) from error
+
+    def check(self, step: int) -> None:
+        """Raise UserError like `manifest` if the files of a checkpoint are not those that were written."""
+        folder, manifest = self.path(step), self.manifest(step)
+        try:
+            found = _checksums(folder)
+        except Exception as error:
+            raise self._unreadable(step, error) from error
+        if found != manifest.files:
+            wrong = sorted(k for k in found.keys() | manifest.files.keys() if found.get(k) != manifest.files.get(k))
+            raise self._damaged(step, f"{wrong[0]} is not what was written")
 
     def params(self, step: int) -> dict[str, Any]:
         """Return the averaged parameters of a checkpoint (leading seed axis where it has several), numpy."""

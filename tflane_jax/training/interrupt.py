@@ -13,7 +13,7 @@ class StopRequest:
     """Inside the block, SIGINT and SIGTERM set `signal`; a second one has its usual effect.
 
     Between `at_once` and `after_the_step`, they raise `Interrupted` as well. Outside the main thread, signals are not
-    touched.
+    touched, and those that the process ignores stay ignored: a shell lets its background commands ignore Ctrl-C.
     """
 
     signal: int | None = None
@@ -23,7 +23,8 @@ class StopRequest:
         self._before = {}
         if threading.current_thread() is threading.main_thread():
             for number in (signal.SIGINT, signal.SIGTERM):
-                self._before[number] = signal.signal(number, self._on_signal)
+                if signal.getsignal(number) != signal.SIG_IGN:
+                    self._before[number] = signal.signal(number, self._on_signal)
         return self
 
     def at_once(self) -> None:

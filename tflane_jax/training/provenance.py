@@ -21,7 +21,9 @@ import jax
 
 import tflane_jax
 from tflane_jax.cores import usable_cores
+from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import write_json
+from tflane_jax.files.wording import counted
 
 _PACKAGES = ("tflane_jax", "jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "numpy", "scipy")
 
@@ -89,13 +91,18 @@ def provenance() -> dict[str, Any]:
 def add_provenance(folder: Path, **more: Any) -> list[str]:
     """Append this start to the run folder's provenance.json, with further entries of plain JSON.
 
+    A damaged file is kept as provenance.damaged.json.
+
     Returns:
-        A line for the user where an earlier start of the run had another thread setting, and one where the latest had
-        other code or packages.
+        A line for the user where the file was damaged, one where an earlier start of the run had another thread
+        setting, and one where the latest had other code or packages.
     """
-    earlier, new = read_provenance(folder), provenance() | more
-    write_json(folder / "provenance.json", [*earlier, new])
+    (earlier, damage), new, path = _starts(folder), provenance() | more, folder / "provenance.json"
     notices = []
+    if damage:
+        kept = _keep_damaged(path)
+        notices.append(f"{path} is damaged: {damage}; it is kept as {kept.name}, the new one has what can be read")
+    write_json(path, [*earlier, new])
     others = [threads for start in earlier if (threads := threads_of(start)) is not None and threads != new["threads"]]
     if others:
         before, now = listed_setting(others[-1]), listed_setting(new["threads"])
@@ -130,12 +137,34 @@ def _changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
 
 def read_provenance(folder: Path) -> list[dict[str, Any]]:
     """Return the record of every start of a run, the first one first; those that are damaged are left out."""
+    return _starts(folder)[0]
+
+
+def _starts(folder: Path) -> tuple[list[dict[str, Any]], str]:
+    """Return the records that can be read, and what is wrong with the others or the file, "" for nothing."""
     try:
         content = json.loads((folder / "provenance.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):
-        return []
-    starts = content if isinstance(content, list) else []
-    return [start for start in starts if isinstance(start, dict) and isinstance(start.get("threads", {}), dict)]
+    except FileNotFoundError:
+        return [], ""
+    except OSError as error:
+        return [], f"it cannot be read ({error.strerror or error})"
+    except (ValueError, RecursionError):
+        return [], "it is no JSON"
+    if not isinstance(content, list):
+        return [], "it holds no list of starts"
+    starts = [one for one in content if isinstance(one, dict) and isinstance(one.get("threads", {}), dict)]
+    lost = len(content) - len(starts)
+    return starts, f"{counted(lost, 'start')} of {len(content)} cannot be read" if lost else ""
+
+
+def _keep_damaged(path: Path) -> Path:
+    """Rename a damaged file, in the place of an earlier one, and return where it is."""
+    kept = path.with_name("provenance.damaged.json")
+    try:
+        os.replace(path, kept)
+    except OSError as error:
+        raise UserError(f"cannot rename {path}, which is damaged: {error.strerror or error}; move it away") from error
+    return kept
 
 
 def _device(count: int | None = None) -> str:

@@ -48,6 +48,13 @@ def latest(checkpoints: Checkpoints) -> Latest | None:
     return found[-1] if found else None
 
 
+def check_resumable(checkpoints: Checkpoints) -> None:
+    """Raise UserError if the latest checkpoint is damaged: before the data are read, which may take long."""
+    if (saved := latest(checkpoints)) is not None:
+        carried(checkpoints, saved, ())
+        checkpoints.check(saved["step"])
+
+
 def carried(checkpoints: Checkpoints, saved: Latest, fresh: Sequence[Memory]) -> Carried:
     """Return what to go on with; raises UserError if it is not what was written, or was written without a training.
 

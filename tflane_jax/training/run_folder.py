@@ -1,7 +1,8 @@
 """The folder of a run: its files, and the lock that only one process at a time can hold.
 
 config.json, config.txt   resolved configuration, as JSON and as text
-provenance.json           git hash, versions, device, cores, threads and command of every start
+provenance.json           git hash, versions, device, cores, threads and command of every start; if it was damaged,
+                          the damaged one is provenance.damaged.json
 metrics.jsonl             records; tensorboard/ holds the same numbers
 checkpoints/              see training.checkpoint
 curves.png, pictures/     drawn at every evaluation
@@ -40,6 +41,7 @@ _FILES = (
     "config.json",
     "config.txt",
     "provenance.json",
+    "provenance.damaged.json",
     "metrics.jsonl",
     "metrics.jsonl.tmp",
     "curves.png",

@@ -10,10 +10,12 @@ import pytest
 from tests.datasets.test_geojson_lanes import crossroads_features, write
 from tests.datasets.test_nuscenes_scenes import content
 from tests.fakes import FakeConfig, FakeDataset
+from tests.shared import assert_same
 from tflane_jax.cli import build_parser, main
 from tflane_jax.commands.sources import check_used, chosen_source
 from tflane_jax.config import load_config
 from tflane_jax.config_overrides import apply_overrides
+from tflane_jax.datasets.recorded_logs import RecordedConfig, RecordedDataset
 from tflane_jax.errors import UserError
 
 
@@ -67,6 +69,13 @@ def test_what_is_no_picture_is_told(out, message, tmp_path, monkeypatch, capsys)
     monkeypatch.chdir(tmp_path)
     assert main(["data", "show", "--data", "street", "--count", "1", "--out", out]) == 2
     assert capsys.readouterr().err == f"tflane: {message}\n"
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(("data", "what"), [("street", "examples"), ("front-views", "images")])
+def test_no_example_is_nothing_to_show(data, what, tmp_path, capsys):
+    assert main(["data", "show", "--data", data, "--count", "0", "--out", str(tmp_path / "sheet.png")]) == 2
+    assert f"{what}, 0 asked for" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
 
 
@@ -211,20 +220,22 @@ def test_recorded_frames_are_drawn_beside_simulated_ones(tmp_path, monkeypatch, 
     np.savez(tmp_path / "scene-0061.npz", **content())
     shown = []
 
-    def draw(dataset, count, out, titles, **_):
+    def draw(path, examples, titles, **_):
         assert titles == ["scene-0061, recorded", "scene-0061, simulated"]
-        shown.extend((dataset.info(i).source, dataset.info(i).scene) for i in range(count))
-        return out
+        shown.extend(examples)
+        return path
 
     def simulated(config):
         assert config.world.mirrored == 0.0  # on the same side of the road as the recording
         return FakeDataset(FakeConfig(2))
 
     # The map of this scene is too small to drive on, and drawing takes time.
-    monkeypatch.setattr("tflane_jax.commands.data_maps.show_dataset", draw)
+    monkeypatch.setattr("tflane_jax.commands.data_maps.save_contact_sheet", draw)
     monkeypatch.setattr("tflane_jax.commands.data_maps.RealMapDataset", simulated)
     assert main(["data", "maps", str(tmp_path), "--out", str(tmp_path / "maps.png")]) == 0
-    assert shown == [("nuscenes-scenes", "scene-0061"), ("fake", FakeDataset(FakeConfig(2)).info(1).scene)]
+    recorded = RecordedDataset(RecordedConfig(tmp_path, ("scene-0061",)))
+    assert_same(shown[0], recorded.example(int(0.7 * len(recorded))))
+    assert_same(shown[1], FakeDataset(FakeConfig(2)).example(1))
     assert "maps.png" in capsys.readouterr().out
     with pytest.raises(SystemExit):
         main(["data", "maps", str(tmp_path), "--moment", "1.0"])

@@ -15,15 +15,14 @@ from tflane_jax.commands.views import with_images
 from tflane_jax.config import FrontViewData, RunConfig, load_config
 from tflane_jax.config_overrides import apply_overrides
 from tflane_jax.datasets import sources
-from tflane_jax.datasets.base import SPLITS
+from tflane_jax.datasets.base import SPLITS, IndexedExamples, spread
 from tflane_jax.datasets.batches import prepared
 from tflane_jax.datasets.overlap import overlap, read_drives
 from tflane_jax.errors import UserError
 from tflane_jax.files.wording import counted
-from tflane_jax.plots import dataset_summary, format_table, save_camera_views, save_table, show_dataset
+from tflane_jax.plots import dataset_summary, format_table, save_camera_views, save_contact_sheet, save_table
 from tflane_jax.plots.tables import written_to
 from tflane_jax.scene import RoadImage, stack_examples
-from tflane_jax.tasks import spread
 from tflane_jax.tasks.lane_pictures import titles
 from tflane_jax.tasks.lane_shape import LaneShapeTask
 
@@ -47,19 +46,26 @@ def show(options: argparse.Namespace, overrides: Sequence[str]) -> int:
     if sources.source_of(source).example is RoadImage:
         return _show_images(source, config, options)
     dataset = sources.make_dataset(source)
-    picture = show_dataset(dataset, options.count, options.out, ground=source.example.ground, view=source.example.range)
-    indices = spread(len(dataset), options.count)
-    examples = stack_examples([dataset.example(index) for index in indices])
-    written = [picture]
+    indices = _chosen(dataset, options.count, "examples")
+    chosen = [dataset.example(index) for index in indices]
+    shape = {"ground": source.example.ground, "view": source.example.range}
+    numbered = [f"{index}: {dataset.info(index).scene[:16]}" for index in indices]
+    written = [save_contact_sheet(options.out, chosen, numbered, **shape)]
+    examples = stack_examples(chosen)
     shown, seen = with_images(examples, source, indices)
     if shown:
         path, names = options.out.with_stem(f"{options.out.stem}-cameras"), titles(dataset, indices)
-        shape = {"ground": source.example.ground, "view": source.example.range}
         written.append(save_camera_views(path, seen, titles=[names[i] for i in shown], **shape))
     title = f"{data_name(source, options)}: {_drawn(len(indices), 'example')}"
     print(format_table(dataset_summary(examples), title=title, digits=2))
     print(f"\n{written_to(written)}")
     return 0
+
+
+def _chosen(dataset: IndexedExamples, count: int, what: str) -> list[int]:
+    if indices := spread(len(dataset), count):
+        return indices
+    raise UserError(f"nothing to show: {dataset.name} has {len(dataset)} {what}, {count} asked for")
 
 
 def _drawn(count: int, what: str) -> str:
@@ -75,9 +81,7 @@ def _show_images(source: Any, config: RunConfig, options: argparse.Namespace) ->
     from tflane_jax.plots.images import save_road_images
 
     dataset = sources.make_dataset(source)
-    if options.count < 1 or len(dataset) == 0:
-        raise UserError(f"nothing to show: {dataset.name} has {len(dataset)} images, {options.count} asked for")
-    indices = spread(len(dataset), options.count)
+    indices = _chosen(dataset, options.count, "images")
     examples = stack_examples([dataset.example(index) for index in indices])
     columns = {"images": examples}
     if (prepare := config.task.prepare(config.data)) is not None:

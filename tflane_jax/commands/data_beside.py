@@ -15,7 +15,7 @@ from tflane_jax.commands.outputs import check_table, folders_of
 from tflane_jax.commands.sources import chosen_source
 from tflane_jax.config import RunConfig
 from tflane_jax.datasets import argoverse2, recorded_logs, sources
-from tflane_jax.datasets.base import ExampleConfig
+from tflane_jax.datasets.base import ExampleConfig, spread
 from tflane_jax.datasets.recorded_logs import RECORDED_EXAMPLE
 from tflane_jax.errors import UserError
 from tflane_jax.evaluation.example_statistics import example_stats
@@ -24,7 +24,6 @@ from tflane_jax.plots import format_table, save_table
 from tflane_jax.plots.distributions import save_distributions
 from tflane_jax.plots.tables import written_to
 from tflane_jax.scene import Example, RoadImage
-from tflane_jax.tasks import spread
 
 _CAPACITIES = ("lanes", "segments", "areas", "tracks", "elements")
 _READS_OPENLANE = argoverse2.SOURCE.name

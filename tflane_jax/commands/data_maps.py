@@ -3,36 +3,16 @@
 from __future__ import annotations
 
 import argparse
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 from tflane_jax.commands.outputs import check_output
-from tflane_jax.datasets.base import Dataset, FrameInfo
 from tflane_jax.datasets.real_maps import RealMapConfig, RealMapDataset
 from tflane_jax.datasets.recorded_logs import RecordedConfig, RecordedDataset
 from tflane_jax.datasets.road_maps import chosen_maps
 from tflane_jax.errors import UserError
-from tflane_jax.plots import show_dataset
+from tflane_jax.plots import save_contact_sheet
 from tflane_jax.scene import Example
 from tflane_jax.world.presets import REAL_MAPS
-
-
-@dataclass
-class _Chosen:
-    """Examples of several datasets, as a dataset."""
-
-    frames: tuple[tuple[Dataset, int], ...]
-    name: str = "maps"
-
-    def __len__(self) -> int:
-        return len(self.frames)
-
-    def example(self, index: int) -> Example:
-        dataset, row = self.frames[index]
-        return dataset.example(row)
-
-    def info(self, index: int) -> FrameInfo:
-        dataset, row = self.frames[index]
-        return dataset.info(row)
 
 
 def run(options: argparse.Namespace) -> int:
@@ -44,16 +24,15 @@ def run(options: argparse.Namespace) -> int:
     if not logs:
         raise UserError(f"{options.root} holds maps without recordings: tflane data show --data real-maps draws those")
     as_recorded = replace(REAL_MAPS, mirrored=0.0)
-    frames: list[tuple[Dataset, int]] = []
+    frames: list[Example] = []
     titles: list[str] = []
     for log in logs:
         recorded = RecordedDataset(RecordedConfig(options.root, (log,)))
         config = RealMapConfig(options.root, (log,), scenes=1, first=options.scene, world=as_recorded)
         simulated = RealMapDataset(config)
         titles += [f"{log[:16]}, recorded", f"{log[:16]}, simulated"]
-        frames += [(recorded, int(len(recorded) * options.moment)), (simulated, len(simulated) - 1)]
+        frames += [recorded.example(int(len(recorded) * options.moment)), simulated.example(len(simulated) - 1)]
     example = RecordedConfig(options.root).example
-    chosen, shown = _Chosen(tuple(frames)), {"ground": example.ground, "view": example.range}
-    path = show_dataset(chosen, len(frames), options.out, titles=titles, **shown)
+    path = save_contact_sheet(options.out, frames, titles, ground=example.ground, view=example.range)
     print(f"written to {path}")
     return 0

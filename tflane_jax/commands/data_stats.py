@@ -13,12 +13,12 @@ from tflane_jax.commands.sources import check_used, chosen_source, data_name
 from tflane_jax.config import RunConfig, load_config
 from tflane_jax.config_overrides import apply_overrides
 from tflane_jax.datasets import sources
+from tflane_jax.datasets.base import spread
 from tflane_jax.errors import UserError
 from tflane_jax.evaluation.example_statistics import example_stats
 from tflane_jax.files.wording import counted
 from tflane_jax.plots import format_table
 from tflane_jax.scene import RoadImage
-from tflane_jax.tasks import spread
 
 
 def stats(options: argparse.Namespace, overrides: Sequence[str]) -> int:

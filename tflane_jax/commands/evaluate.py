@@ -13,6 +13,7 @@ from tflane_jax.commands.outputs import check_table
 from tflane_jax.commands.sources import data_name, limited_task, opened, source_for
 from tflane_jax.config_io import to_json
 from tflane_jax.datasets import sources
+from tflane_jax.datasets.base import spread
 from tflane_jax.datasets.front_views import FrontViewConfig, FrontViewDataset
 from tflane_jax.datasets.overlap import Nearness
 from tflane_jax.errors import UserError
@@ -23,7 +24,7 @@ from tflane_jax.plots.tables import format_table, save_table, written_to
 from tflane_jax.runs import Run, evaluate_run
 from tflane_jax.scene import stack_examples
 from tflane_jax.startup import showing, stage
-from tflane_jax.tasks.base import Model, spread
+from tflane_jax.tasks.base import Model
 from tflane_jax.tasks.edge_types import save_edge_types
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.tasks.lane_shape import LaneShapeTask

@@ -17,6 +17,7 @@ import numpy as np
 from tflane_jax.commands.predict_lanes import MOST_DRAWN
 from tflane_jax.commands.sources import chosen_source, make_folder, model_title
 from tflane_jax.datasets import sources
+from tflane_jax.datasets.base import spread
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import delete_older, write_text
 from tflane_jax.files.tusimple import RowLanes
@@ -25,7 +26,6 @@ from tflane_jax.plots.figure import can_draw
 from tflane_jax.plots.images import save_road_images
 from tflane_jax.runs import Run
 from tflane_jax.scene import stack_examples
-from tflane_jax.tasks import spread
 from tflane_jax.tasks.lane_shape import found_lanes, predict_curves
 
 

@@ -38,7 +38,7 @@ from jaxtyping import Float, Int
 from tflane_jax.commands.sources import limited_task, make_folder, model_title, source_for
 from tflane_jax.commands.views import with_images
 from tflane_jax.datasets import sources
-from tflane_jax.datasets.base import Dataset, FrameInfo
+from tflane_jax.datasets.base import Dataset, FrameInfo, spread
 from tflane_jax.datasets.data_source import LaneGraphSource
 from tflane_jax.datasets.procedural import SimulatedDataset
 from tflane_jax.errors import UserError
@@ -53,7 +53,6 @@ from tflane_jax.plots.figure import can_draw
 from tflane_jax.plots.segments import true_lanes
 from tflane_jax.runs import Run
 from tflane_jax.scene import Example, LanePrediction, LinePrediction, Prediction
-from tflane_jax.tasks import spread
 from tflane_jax.tasks.answers import answer_arrays
 from tflane_jax.tasks.lane_pictures import titles
 

@@ -164,6 +164,11 @@ def made(dataset: IndexedExamples, index: int) -> Any:
         raise
 
 
+def spread(size: int, count: int) -> list[int]:
+    """Return `count` indices spread evenly over `size` (all of them if there are fewer); none for less than one."""
+    return np.unique(np.linspace(0, size - 1, min(max(count, 0), size)).round().astype(int)).tolist()
+
+
 class Dataset(IndexedExamples, Protocol):
     """Lane graphs around the vehicle."""
 

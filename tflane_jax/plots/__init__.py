@@ -10,7 +10,7 @@ from tflane_jax.plots.cameras import save_camera_views
 from tflane_jax.plots.curves import save_curves
 from tflane_jax.plots.differences import Findings, save_differences
 from tflane_jax.plots.figure import new_figure, save_figure
-from tflane_jax.plots.gallery import add_legend, save_examples, show_dataset
+from tflane_jax.plots.gallery import add_legend, save_contact_sheet, save_examples
 from tflane_jax.plots.summary import dataset_summary
 from tflane_jax.plots.tables import format_table, save_table
 
@@ -30,10 +30,10 @@ __all__ = [
     "format_table",
     "new_figure",
     "save_camera_views",
+    "save_contact_sheet",
     "save_curves",
     "save_differences",
     "save_examples",
     "save_figure",
     "save_table",
-    "show_dataset",
 ]

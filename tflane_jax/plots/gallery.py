@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Literal, TypeVar
 
 import numpy as np
 
-from tflane_jax.errors import UserError
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.plots.bev import GROUND, INPUTS, VIEW, Layer, draw_found, draw_scene, inputs_title, truth_layers
 from tflane_jax.plots.figure import hide_unused, new_figure, save_figure
@@ -31,7 +30,6 @@ from tflane_jax.scene import Example, row_of
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from tflane_jax.datasets.base import Dataset
 
 _PANEL_WIDTH = 4.8  # inches
 # Of a contact sheet with two examples side by side: text stays readable where a page shows the whole sheet.
@@ -102,38 +100,29 @@ def save_examples(
     return save_figure(figure, path)
 
 
-def show_dataset(
-    dataset: Dataset,
-    count: int,
-    out: Path,
+def save_contact_sheet(
+    path: Path,
+    examples: Sequence[Example],
+    titles: Sequence[str],
     *,
-    titles: Sequence[str] | None = None,
     ground: PerceptionRange = GROUND,
     view: PerceptionRange = VIEW,
 ) -> Path:
-    """Write a contact sheet of `count` examples spread evenly over the dataset (all of them if it has fewer).
-
-    Each has two panels: the truth, and evidence with priors.
+    """Write a contact sheet of one or more examples: of each the truth, and evidence with priors.
 
     Args:
-        dataset: the examples.
-        count: how many are drawn.
-        out: .png, .pdf, .svg or .jpg.
-        titles: of all examples of the dataset; None: their numbers and scenes.
+        path: .png, .pdf, .svg or .jpg.
+        examples: what is drawn.
+        titles: one for each example.
         ground: range of evidence and line of sight in the examples.
         view: range that is shown.
 
-    Returns the path. Raises UserError for an empty dataset or a count of 0, or where the file cannot be written.
+    Returns the path. Raises UserError where the file cannot be written.
     """
-    if len(dataset) == 0 or count < 1:
-        raise UserError(f"nothing to show: {dataset.name} has {len(dataset)} examples, {count} asked for")
-    chosen = np.unique(np.linspace(0, len(dataset) - 1, min(count, len(dataset))).round().astype(int))
-    pairs, inches, dpi = (2, _SMALL_PANEL_WIDTH, _SMALL_PANEL_DPI) if len(chosen) > 1 else (1, _PANEL_WIDTH, 110)
-    figure, axes = new_figure(-(-len(chosen) // pairs), 2 * pairs, panel=panel_size(view, inches), footer=_FOOTER)
+    pairs, inches, dpi = (2, _SMALL_PANEL_WIDTH, _SMALL_PANEL_DPI) if len(examples) > 1 else (1, _PANEL_WIDTH, 110)
+    figure, axes = new_figure(-(-len(examples) // pairs), 2 * pairs, panel=panel_size(view, inches), footer=_FOOTER)
     true: tuple[Layer, ...] = ()
-    example: Example | None = None
-    for (truth, seen), index in zip(axes.reshape(-1, 2), chosen.tolist(), strict=False):
-        example, info = dataset.example(index), dataset.info(index)
+    for (truth, seen), example, title in zip(axes.reshape(-1, 2), examples, titles, strict=False):
         true = truth_layers(None) if example.map_lines is None else ("map_lines",)
         draw_scene(
             truth,
@@ -141,13 +130,13 @@ def show_dataset(
             layers=("hidden", *true, "elements"),
             ground=ground,
             view=view,
-            title=f"{f'{index}: {info.scene[:16]}' if titles is None else titles[index]}, truth",
+            title=f"{title}, truth",
         )
         draw_scene(seen, example, layers=INPUTS, ground=ground, view=view, title=inputs_title(example))
-    hide_unused(axes, 2 * len(chosen))
+    hide_unused(axes, 2 * len(examples))
     label_edges(axes)
-    add_legend(figure, "scenes", drawn=true, examples=example)
-    return save_figure(figure, out, dpi=dpi)
+    add_legend(figure, "scenes", drawn=true, examples=examples[-1])
+    return save_figure(figure, path, dpi=dpi)
 
 
 def add_legend(

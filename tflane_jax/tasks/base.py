@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar
 
 import jax
-import numpy as np
 from jaxtyping import Array, Float
 
 from tflane_jax.datasets.data_source import SplitData
@@ -205,8 +204,3 @@ class Task(Generic[ExampleT, DataT, SourceT, MemoryT]):
 
 AnyTask = Task[Any, Any, Any, Any]
 """A task of which only the common methods are used."""
-
-
-def spread(size: int, count: int) -> list[int]:
-    """Return `count` indices spread evenly over `size` (all of them if there are fewer); none for less than one."""
-    return np.unique(np.linspace(0, size - 1, min(max(count, 0), size)).round().astype(int)).tolist()

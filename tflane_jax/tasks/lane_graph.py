@@ -16,6 +16,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from tflane_jax.datasets import sources
+from tflane_jax.datasets.base import spread
 from tflane_jax.datasets.batches import first_example
 from tflane_jax.datasets.clips import as_clips
 from tflane_jax.datasets.data_source import LaneGraphSource, SplitData
@@ -40,7 +41,7 @@ from tflane_jax.models.priors import ByPrior, observe, observe_clip
 from tflane_jax.models.toponet import TopoNetConfig
 from tflane_jax.scene import Example, Prediction, shapes_of, stack_examples
 from tflane_jax.tasks import score_names
-from tflane_jax.tasks.base import Draw, Model, Recorded, Task, spread
+from tflane_jax.tasks.base import Draw, Model, Recorded, Task
 from tflane_jax.tasks.fit import (
     check_augmentation,
     check_fit,

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from tflane_jax.datasets import sources
-from tflane_jax.datasets.base import Dataset
+from tflane_jax.datasets.base import Dataset, spread
 from tflane_jax.datasets.batches import ordered_batches
 from tflane_jax.datasets.data_source import LaneGraphSource
 from tflane_jax.datasets.streaming import Streamed
@@ -29,7 +29,7 @@ from tflane_jax.evaluation.interventions import scene_numbers
 from tflane_jax.evaluation.lane_groups import lane_groups, line_groups
 from tflane_jax.evaluation.predict import FOR_PICTURES, predict_examples, predicted_batches
 from tflane_jax.scene import Example, LaneGraph, LanePrediction, MapLines, Prediction, stack_examples
-from tflane_jax.tasks.base import Model, spread
+from tflane_jax.tasks.base import Model
 
 Group = Literal["hidden+traffic", "occluded"]
 Field = Literal["lanes", "segments", "map_lines"]

@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 
 from tflane_jax.datasets import sources
 from tflane_jax.datasets.augmentation import augment
+from tflane_jax.datasets.base import spread
 from tflane_jax.datasets.batches import chosen_examples, count
 from tflane_jax.datasets.data_source import SplitData
 from tflane_jax.datasets.front_views import FrontViewConfig
@@ -46,7 +47,7 @@ from tflane_jax.models.lstr import LstrConfig, normalise
 from tflane_jax.models.lstr_init import lstr_init
 from tflane_jax.models.parameters import Params, joined_statistics, split_statistics
 from tflane_jax.scene import CurvePrediction, LaneLines, Prediction, RoadImage, shapes_of, stack_examples
-from tflane_jax.tasks.base import Draw, Model, Recorded, Task, spread
+from tflane_jax.tasks.base import Draw, Model, Recorded, Task
 from tflane_jax.tasks.edge_types import save_edge_types
 from tflane_jax.world.front_view.lines import CAPACITY, ROW_FRACTIONS
 

@@ -186,17 +186,14 @@ def test_steep_turns_swap_points_of_one_line():
 
 def test_of_lines_that_a_turn_bends_back_the_near_part_stays():
     """Points on an arc: after a turn by 45 degrees, its far end has rows that its near end has, too."""
-    angles = np.radians(np.linspace(90.0, 0.0, 10))  # from the far end, where the arc is level, to the near one
+    angles = np.radians(np.linspace(90.0, 0.0, 11))  # from the far end, where the arc is level, to the near one
     arc = np.stack([0.3 + 0.2 * np.cos(angles), 0.6 - 0.2 * np.sin(angles)], -1)
-    size = np.array([HEIGHT, HEIGHT])  # a square image, so that the map below is a rotation
-    points, valid = np.zeros((2, 12, 2), np.float32), np.zeros((2, 12), bool)
-    points[0, 1:11], valid[0, 1:11] = arc, True
+    points, valid = np.pad(arc, ((1, 1), (0, 0)))[None].astype(np.float32), np.arange(13)[None] % 12 > 0
     cos = math.sqrt(0.5)
     turn = np.array([[cos, cos, 0.0], [-cos, cos, 0.3 * HEIGHT], [0.0, 0.0, 1.0]])
-    after = warp_lines(LaneLines(points, valid, np.array([True, False])), turn, *size)
-    turned = arc @ turn[:2, :2].T + [0.0, 0.3]
-    near = turned[int(turned[:, 1].argmin()) :]  # its rows ascend to the near end
-    assert 4 <= len(near) <= 6
+    after = warp_lines(LaneLines(points, valid, np.array([True])), turn, HEIGHT, HEIGHT)
+    near = (arc @ turn[:2, :2].T + [0.0, 0.3])[-6:]  # the rows ascend from the middle to the near end
+    assert near[:, 1].argmin() == 0
     np.testing.assert_allclose(after.points[0][after.point_valid[0]], near, atol=1e-6)
 
 

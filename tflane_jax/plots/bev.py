@@ -17,7 +17,6 @@ from tflane_jax.plots.lines import add_arrows, add_crossings, add_lines, add_lin
 from tflane_jax.plots.map_lines import draw_line_prediction, draw_map_lines
 from tflane_jax.plots.priors import draw_markers, draw_sd_map, draw_traffic
 from tflane_jax.plots.segments import (
-    LanePrediction,
     draw_segment_prediction,
     draw_segments,
     true_lanes,
@@ -28,6 +27,7 @@ from tflane_jax.scene import (
     AreaType,
     Example,
     LaneGraph,
+    LanePrediction,
     LinePrediction,
     SegmentPrediction,
     TrafficElements,

@@ -20,12 +20,13 @@ from tflane_jax.plots.images import draw_image
 from tflane_jax.plots.legends import above_entries, boundary_entries, truth_entry
 from tflane_jax.plots.lines import valid_rows
 from tflane_jax.plots.map_lines import chosen_lines, class_entries
-from tflane_jax.plots.segments import LanePrediction, boundary_types, chosen_areas, chosen_segments
+from tflane_jax.plots.segments import boundary_types, chosen_areas, chosen_segments
 from tflane_jax.scene import (
     AreaType,
     CameraViews,
     ElementPrediction,
     Example,
+    LanePrediction,
     LineClass,
     LinePrediction,
     LineType,

@@ -26,8 +26,8 @@ from tflane_jax.plots.legends import (
 )
 from tflane_jax.plots.map_lines import class_entries
 from tflane_jax.plots.priors import prior_entries
-from tflane_jax.plots.segments import LanePrediction, truth_lines
-from tflane_jax.scene import BevChannel, Example, RoadUser, row_of
+from tflane_jax.plots.segments import truth_lines
+from tflane_jax.scene import BevChannel, Example, LanePrediction, RoadUser, row_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

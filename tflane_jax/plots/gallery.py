@@ -24,12 +24,10 @@ from tflane_jax.plots.legends import (
 )
 from tflane_jax.plots.map_lines import class_entries
 from tflane_jax.plots.priors import prior_entries
-from tflane_jax.plots.segments import LanePrediction
-from tflane_jax.scene import Example, row_of
+from tflane_jax.scene import Example, LanePrediction, row_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
 
 _PANEL_WIDTH = 4.8  # inches
 # Of a contact sheet with two examples side by side: text stays readable where a page shows the whole sheet.

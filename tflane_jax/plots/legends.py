@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 from tflane_jax.plots import style
 from tflane_jax.plots.priors import prior_entries
-from tflane_jax.plots.segments import LINE_STYLES, LanePrediction
-from tflane_jax.scene import BevChannel, Example, LinePrediction, LineType
+from tflane_jax.plots.segments import LINE_STYLES
+from tflane_jax.scene import BevChannel, Example, LanePrediction, LinePrediction, LineType
 
 if TYPE_CHECKING:
     from matplotlib.lines import Line2D

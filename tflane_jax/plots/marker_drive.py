@@ -21,9 +21,8 @@ from tflane_jax.plots.cameras import draw_projected
 from tflane_jax.plots.figure import new_figure, save_figure
 from tflane_jax.plots.images import draw_image
 from tflane_jax.plots.lines import add_arrows, add_lines
-from tflane_jax.plots.segments import LanePrediction
 from tflane_jax.priors.marker_memory import MarkerGuidance
-from tflane_jax.scene import CameraViews
+from tflane_jax.scene import CameraViews, LanePrediction
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -16,6 +16,7 @@ from tflane_jax.scene import (
     CenterlinePrediction,
     Example,
     LaneGraph,
+    LanePrediction,
     LinePrediction,
     LineType,
     SegmentPrediction,
@@ -23,9 +24,6 @@ from tflane_jax.scene import (
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-
-LanePrediction = CenterlinePrediction | SegmentPrediction | LinePrediction
-"""Predictions that the pictures of lanes, or of lines of a vector map, show."""
 
 LINE_STYLES = {LineType.NONE: (0, (1.0, 2.5)), LineType.SOLID: "solid", LineType.DASHED: (0, (5.0, 3.0))}
 """Dashes of boundaries, in widths of the line; NONE is dotted and thin."""

@@ -139,6 +139,7 @@ class CurvePrediction:
 
 
 LanePrediction = CenterlinePrediction | SegmentPrediction | LinePrediction
+"""Lanes around the vehicle, or lines of a vector map."""
 
 
 @struct.dataclass

@@ -109,6 +109,7 @@ def test_a_command_does_not_wait_for_a_thread_that_compiles(left, code):
 @pytest.mark.parametrize(
     ("where", "says"), [("init", "before the run began: give the same"), ("loss", "--resume --out")]
 )
+@pytest.mark.usefixtures("interruptible")
 def test_a_signal_before_the_first_step_ends_the_command(tmp_path, capsys, monkeypatch, number, where, says):
     whole, went_on = getattr(LaneGraphTask, where), []
 

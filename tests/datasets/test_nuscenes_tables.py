@@ -281,9 +281,9 @@ def test_a_folder_of_tables_and_maps_alone_is_sound(tmp_path):
     assert (found.faults, [row["missing images"] for row in found.rows]) == ([], [0, 0])
     assert found.skipped == [f"images were not looked for: there is no {tmp_path / 'samples'}"]
     (tmp_path / "samples").mkdir()
-    assert [fault.partition(" images")[0] for fault in check_nuscenes(tmp_path).faults] == [
-        "scene-0061: 4",
-        "scene-0103: 2",
+    assert [fault.partition(" image")[0] for fault in check_nuscenes(tmp_path).faults] == [
+        "scene-0061 lacks 4",
+        "scene-0103 lacks 2",
     ]
 
 

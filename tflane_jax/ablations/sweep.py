@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import sys
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
@@ -20,6 +19,7 @@ from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import check_folder
 from tflane_jax.files.wording import counted
 from tflane_jax.migrations import value_at
+from tflane_jax.plots.figure import can_draw
 from tflane_jax.plots.tables import format_table, save_table
 from tflane_jax.progress import progress_bar
 from tflane_jax.runs import Run, open_run
@@ -107,7 +107,7 @@ def sweep(
     meta = {"protocol": protocol, "checkpoint": which, "setting": setting, "values": list(values), "scores": scores}
     written = list(save_table(out / "sweep", rows, meta, title=title))
     print("\n" + format_table(rows, title=title))
-    if importlib.util.find_spec("matplotlib") is not None:
+    if can_draw():
         from tflane_jax.plots.sweep import save_sweep
 
         first = next(iter(runs.values()))[0].config

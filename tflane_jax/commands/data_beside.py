@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import importlib.util
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,6 +21,7 @@ from tflane_jax.evaluation.example_statistics import example_stats
 from tflane_jax.evaluation.scene_statistics import frame_quantities, lane_quantities, pooled
 from tflane_jax.plots import format_table, save_table
 from tflane_jax.plots.distributions import save_distributions
+from tflane_jax.plots.figure import can_draw
 from tflane_jax.plots.tables import written_to
 from tflane_jax.scene import Example, RoadImage
 
@@ -70,7 +70,7 @@ def beside(config: RunConfig, options: argparse.Namespace) -> int:
     paths: list[Path] = []
     if options.out is not None:
         paths += save_table(options.out, rows, {"values": _summary(values)}, title=title)
-        if importlib.util.find_spec("matplotlib") is not None:
+        if can_draw():
             paths.append(save_distributions(options.out.with_name(f"{options.out.name}.png"), values))
     print(format_table(rows, title=title))
     if paths:

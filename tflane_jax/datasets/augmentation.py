@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from tflane_jax.files.images import opencv
 from tflane_jax.limits import Factor, Fraction, PositiveOrZero, within
@@ -148,8 +148,7 @@ def warp_lines(lines: LaneLines, warp: Float[np.ndarray, "3 3"], height: int, wi
     valid = before & ((points >= 0.0) & (points <= 1.0)).all(-1)
 
     # Strong rotations can swap the rows of points: sort the valid ones among their own places.
-    places = np.argsort(~valid, axis=-1, kind="stable")
-    valid = _before_the_bend(points[..., 1], valid, places)
+    valid = _before_the_bend(points[..., 1], valid)
     places = np.argsort(~valid, axis=-1, kind="stable")
     order = np.argsort(np.where(valid, points[..., 1], np.inf), axis=-1, kind="stable")
     arranged = np.zeros_like(points)
@@ -165,17 +164,15 @@ def warp_lines(lines: LaneLines, warp: Float[np.ndarray, "3 3"], height: int, wi
     return LaneLines(np.where(valid[..., None], points, 0.0).astype(np.float32), valid, kept)
 
 
-def _before_the_bend(
-    row: Float[np.ndarray, "l p"], valid: Bool[np.ndarray, "l p"], places: Int[np.ndarray, "l p"]
-) -> Bool[np.ndarray, "l p"]:
-    """Return the valid points up to where a line, seen from its last point (the nearest), turns back to rows it had.
+def _before_the_bend(row: Float[np.ndarray, "l p"], valid: Bool[np.ndarray, "l p"]) -> Bool[np.ndarray, "l p"]:
+    """Return the valid points from a line's last one, which is nearest, to where its rows turn back.
 
-    A line has one point in a row. `places` has the valid points of each line first, in their order.
+    A line has one point in a row.
     """
-    step = np.diff(np.take_along_axis(row, places, -1))
-    steps = np.arange(step.shape[-1]) < valid.sum(-1, keepdims=True) - 1
-    last = np.take_along_axis(step, np.maximum(valid.sum(-1, keepdims=True) - 2, 0), -1) if step.size else 0.0
-    turns = steps & (step * last < 0.0)
+    places = np.argsort(~valid, axis=-1, kind="stable")  # the valid points first, in their order
+    step, count = np.diff(np.take_along_axis(row, places, -1)), valid.sum(-1, keepdims=True)
+    last = np.take_along_axis(step, np.maximum(count - 2, 0), -1) if step.size else 0.0
+    turns = (np.arange(step.shape[-1]) < count - 1) & (step * last < 0.0)
     beyond = np.logical_or.accumulate(turns[:, ::-1], -1)[:, ::-1]
     kept = valid.copy()
     np.put_along_axis(kept, places[:, :-1], np.take_along_axis(valid, places[:, :-1], -1) & ~beyond, -1)

@@ -86,9 +86,9 @@ def named(name: Any) -> str:
     return f"{text if plain else repr(text):.{_LONGEST_NAME}}"
 
 
-def counted(number: int, thing: str, things: str = "") -> str:
-    """Return a number of things in words: "1 frame", "2 frames"; `things` is the plural where it does not end in s."""
-    return f"{number} {thing if number == 1 else things or thing + 's'}"
+def counted(number: int, thing: str) -> str:
+    """Return a number of things in words: "1 frame", "2 frames"."""
+    return f"{number} {thing}{'' if number == 1 else 's'}"
 
 
 def first_of(names: Sequence[Any]) -> str:

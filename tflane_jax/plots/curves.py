@@ -15,7 +15,7 @@ from tflane_jax.errors import UserError
 from tflane_jax.files.wording import counted
 from tflane_jax.metrics.directions import lower_is_better, unit_of
 from tflane_jax.plots import style
-from tflane_jax.plots.figure import TITLE, columns_for, hide_unused, new_figure, save_figure
+from tflane_jax.plots.figure import TITLE_WIDTH, columns_for, hide_unused, new_figure, save_figure
 from tflane_jax.plots.names import score_title
 
 if TYPE_CHECKING:
@@ -105,7 +105,7 @@ def save_comparison_curves(
     draw = _draw_points if once else _draw_panel
     for ax, (name, series) in zip(axes.flat, panels.items(), strict=False):
         title = f"validation: {score_title(name)}, {unit_of(name)[1]}"
-        ax.set_title(textwrap.fill(title, TITLE), fontsize=9, loc="left")
+        ax.set_title(textwrap.fill(title, TITLE_WIDTH), fontsize=9, loc="left")
         draw(ax, series, styles)
     hide_unused(axes, len(panels))
     lines = {str(line.get_label()): line for ax in axes.flat for line in ax.lines}

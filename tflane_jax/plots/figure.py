@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-TITLE = 44
+TITLE_WIDTH = 44
 """Characters of a line above a panel of 3.7 inches, of 9 points."""
 # On a side of a picture: matplotlib's limit.
 _MOST_PIXELS = 2**16

@@ -11,7 +11,7 @@ import numpy as np
 from tflane_jax.files.wording import counted
 from tflane_jax.metrics.directions import unit_of
 from tflane_jax.plots import style
-from tflane_jax.plots.figure import TITLE, columns_for, hide_unused, new_figure, save_figure
+from tflane_jax.plots.figure import TITLE_WIDTH, columns_for, hide_unused, new_figure, save_figure
 from tflane_jax.plots.names import score_title
 
 Scores = Mapping[str, Sequence[Sequence[Mapping[str, float]]]]
@@ -49,7 +49,7 @@ def save_sweep(
             label = f"{model} ({counted(max(map(len, by_value)), 'seed')})"
             ax.plot(places[order], mean, **look, marker="o", ms=3, lw=1.4, label=label)
             ax.fill_between(places[order], mean - spread, mean + spread, color=look["color"], alpha=0.15, lw=0)
-        ax.set_title(textwrap.fill(f"{score_title(metric)}, {unit}", TITLE), fontsize=9, loc="left")
+        ax.set_title(textwrap.fill(f"{score_title(metric)}, {unit}", TITLE_WIDTH), fontsize=9, loc="left")
         ax.set_xlabel("\n".join([setting, *textwrap.wrap(meaning, 52)]), fontsize=8)
         if ticks is not None:
             ax.set_xticks(places, ticks)

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import importlib.util
 from collections.abc import Mapping
 from pathlib import Path
 
 from tflane_jax.evaluation.edge_types import edge_types
 from tflane_jax.models.lstr import LstrConfig
+from tflane_jax.plots.figure import can_draw
 from tflane_jax.plots.tables import save_table
 from tflane_jax.scene import RoadImage
 from tflane_jax.tasks.base import Model
@@ -31,7 +31,7 @@ def save_edge_types(models: Mapping[str, Model], examples: RoadImage, stem: Path
     rows = [{"model": name} | row for name, one in found.items() for row in one.rows()]
     title = "Weights of the edge types that the encoder selects (GTN) or attends with (HAN, mean over images)"
     written = list(save_table(stem, rows, {"images": len(examples.image)}, title=title, digits=2))
-    if importlib.util.find_spec("matplotlib") is not None:
+    if can_draw():
         from tflane_jax.plots.edge_types import save_edge_types as save_picture
 
         written.append(save_picture(stem.with_name(f"{stem.name}.png"), found))

@@ -38,5 +38,5 @@ def cheap():
         patch.setattr(LaneGraphTask, "evaluate", evaluate)
         patch.setattr(LaneGraphTask, "draw_comparison", draw)
         patch.setattr("tflane_jax.runs._drawing", lambda *_: None)
-        patch.setattr("tflane_jax.plots.curves.save_comparison_curves", draw_curves)
+        patch.setattr("tflane_jax.ablations.table_run.save_comparison_curves", draw_curves)
         yield

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import sys
 
 import pytest
 
@@ -9,6 +10,7 @@ from tests.shared import ROOT
 from tflane_jax.ablations import published
 from tflane_jax.ablations.published import page, record
 from tflane_jax.cli import main
+from tflane_jax.errors import install
 
 
 def test_the_page_leaves_out_best_checkpoints_that_repeat_the_last(tmp_path):
@@ -112,13 +114,14 @@ def test_another_json_file_is_named_before_anything_is_trained(tmp_path, capsys,
     assert [path.name for path in tmp_path.iterdir()] == ["sweep.json"]
 
 
-def test_without_matplotlib_the_page_has_no_pictures_beside_it(tmp_path, monkeypatch):
+def test_without_matplotlib_the_page_has_no_pictures_beside_it(tmp_path, monkeypatch, capsys):
     folder = tmp_path / "results"
     folder.mkdir()
     shutil.copy(ROOT / "docs" / "results" / "markers.3.json", folder)
     with monkeypatch.context() as patch:
-        patch.setattr(published.importlib.util, "find_spec", lambda name: None)
+        patch.setitem(sys.modules, "matplotlib", None)
         record([], folder)
+    assert capsys.readouterr().err == f"no pictures, which need matplotlib: {install('plot')}\n"
     assert (tmp_path / "results.md").read_text() == page(folder)
     assert [path.name for path in folder.iterdir()] == ["markers.3.json"]
     record([], folder)

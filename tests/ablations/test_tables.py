@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -85,7 +86,7 @@ def stopped_at_the_third(table, out, monkeypatch):
     return begun
 
 
-def test_a_table_from_training_to_page(tiny, tmp_path, capsys):
+def test_a_table_from_training_to_page(tiny, tmp_path, monkeypatch, capsys):
     out = tmp_path / "out"
     path = run_table(small(tiny), range(2), out)
     folder = out / "paper.9"
@@ -120,10 +121,15 @@ def test_a_table_from_training_to_page(tiny, tmp_path, capsys):
     assert len(list((out / "runs").glob("*/config.json"))) == 6
     run_table(small(tiny, name="paper.10"), range(2), out)
     assert len(list((out / "runs").glob("*/config.json"))) == 6
-    for name in ("table.md", "summary.json"):
+    for name in ("table.md", "summary.json", "comparison.png", "curves.png"):
         (folder / name).unlink()
-    run_table(small(tiny), range(2), out)
+    capsys.readouterr()
+    with monkeypatch.context() as patch:
+        patch.setitem(sys.modules, "matplotlib", None)
+        run_table(small(tiny), range(2), out)
     assert {name: (folder / name).read_bytes() for name in TABLE_FILES} == before
+    assert list(folder.glob("*.png")) == []
+    assert capsys.readouterr().err.count("no pictures, which need matplotlib: ") == 1
 
     record([folder / "summary.json"], tmp_path / "results")
     written = (tmp_path / "results.md").read_text()

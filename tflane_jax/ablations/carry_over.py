@@ -43,6 +43,7 @@ from tflane_jax.ablations.workers import noted, train_all, worker_threads
 from tflane_jax.errors import UserError
 from tflane_jax.evaluation.interventions import NO_TRAFFIC
 from tflane_jax.files.wording import counted
+from tflane_jax.plots.figure import can_draw
 from tflane_jax.plots.tables import format_table, save_table
 from tflane_jax.progress import progress_bar
 from tflane_jax.runs import open_run
@@ -249,6 +250,8 @@ def _tests(found: ByLog, logs: Sequence[str], declared: Declared) -> list[dict[s
 
 def _draw(plan: Plan, failures: Sequence[Failure], out: Path) -> None:
     """Draw frames of each log with its truth and the predictions of two models that have not seen it."""
+    if not can_draw():
+        return
     failed = {failure.job.folder for failure in failures}
     for log in plan.logs:
         models = {}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ from tflane_jax.config import RunConfig
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import write_json
 from tflane_jax.own_modules import own_code
+from tflane_jax.plots.figure import can_draw
 from tflane_jax.progress import progress_bar
 from tflane_jax.runs import open_run
 from tflane_jax.tasks import Model
@@ -98,12 +98,12 @@ def first_models(trained: Mapping[str, Sequence[Job]], results: Results) -> dict
 
 
 def draw_models(first: RunConfig, models: Mapping[str, Model], pair: Sequence[str], path: Path) -> list[Path]:
-    """Draw test frames in which the first two models differ, those of `pair` first; nothing without matplotlib.
+    """Draw test frames in which the first two models differ, those of `pair` first; without matplotlib, say so.
 
     Returns:
         The picture, if it was drawn.
     """
-    if importlib.util.find_spec("matplotlib") is None:
+    if not can_draw():
         return []
     ordered = {name: models[name] for name in sorted(models, key=lambda name: name not in pair)}
     return [first.task.draw_comparison(ordered, first.data.source("test"), load_test_data(first), path)]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import re
 import textwrap
@@ -20,6 +19,7 @@ from tflane_jax.files.atomic import write_text
 from tflane_jax.files.fields import load_json, member
 from tflane_jax.files.wording import counted
 from tflane_jax.plots.claims import save_claims
+from tflane_jax.plots.figure import can_draw
 from tflane_jax.plots.tables import format_table
 
 _WIDTH = 120
@@ -58,7 +58,7 @@ def record(summaries: Sequence[Path], folder: Path) -> Path:
             continue
         write_text(there, json.dumps(content, indent=1) + "\n")
     written = write_text(folder.with_name(f"{folder.name}.md"), page(folder))
-    if importlib.util.find_spec("matplotlib") is not None:
+    if can_draw():
         draw_claims(folder)
     return written
 

@@ -13,7 +13,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -57,6 +56,8 @@ from tflane_jax.datasets.sources import source_of
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import write_json, write_text
 from tflane_jax.files.fields import load_json
+from tflane_jax.plots.curves import save_comparison_curves
+from tflane_jax.plots.figure import can_draw
 from tflane_jax.plots.tables import format_table, latex_table, latex_text, save_table
 from tflane_jax.progress import progress_bar
 
@@ -216,9 +217,10 @@ def finish_table(run: TableRun, failures: Sequence[Failure]) -> Path:
     save_effects(results, run.declared, OWN_TEST, tested, folder / "effects", no_drives=no_drives)
     pair = (table.claims[0].control or table.rows[0].name, table.claims[0].treatment)
     models = first_models(trained, results)
-    if {results.owners.get(row, row) for row in pair} <= models.keys():  # recorded runs have no parameters
-        draw_models(first, models, pair, folder / "comparison.png")
-    _draw_curves(table, trained, folder / "curves.png")
+    if can_draw():
+        if {results.owners.get(row, row) for row in pair} <= models.keys():  # recorded runs have no parameters
+            draw_models(first, models, pair, folder / "comparison.png")
+        _draw_curves(table, trained, folder / "curves.png")
     _save_summary(table, run.declared, results, trained, tested, folder, quick=quick)
     print(f"\n{table.name}: {folder} has tables, tests, curves and pictures ({time.monotonic() - run.began:.0f} s)")
     if failed := failures[len(waiting) :]:
@@ -297,11 +299,7 @@ def _save_scores(table: PaperTable, results: Results, folder: Path, *, quick: bo
 
 
 def _draw_curves(table: PaperTable, trained: Mapping[str, Sequence[Job]], path: Path) -> None:
-    """Draw validation scores over training, one panel a score; nothing without matplotlib or evaluations."""
-    if importlib.util.find_spec("matplotlib") is None:
-        return
-    from tflane_jax.plots.curves import save_comparison_curves
-
+    """Draw validation scores over training, one panel a score; nothing without evaluations."""
     records = {name: [facts(job).validation for job in jobs] for name, jobs in trained.items() if jobs}
     save_comparison_curves(path, records, _curves(table))
 

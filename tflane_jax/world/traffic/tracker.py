@@ -60,7 +60,7 @@ class TrackerConfig:
     look_every_s: Positive = 0.3
 
     def with_noise(self, scale: float) -> TrackerConfig:
-        """Return the tracker with noise and misses scaled."""
+        """Return the tracker with noise (that of sizes excepted) and misses scaled."""
         return replace(
             self,
             drop=min(self.drop * scale, 1.0),

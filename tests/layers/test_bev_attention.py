@@ -13,7 +13,8 @@ from tests.golden_compare import compare
 from tests.layers.batch_bugs import EXAMPLES, like_the_reference
 from tests.slow import with_slow
 from tflane_jax.convert.bevformer import SPATIAL_ATTENTION, TEMPORAL_ATTENTION
-from tflane_jax.layers.bev_attention import LOST, SpatialCrossAttention, TemporalSelfAttention, first_seen
+from tflane_jax.layers.bev_attention import SpatialCrossAttention, TemporalSelfAttention
+from tflane_jax.layers.camera_queries import LOST, first_seen
 
 
 @pytest.mark.golden

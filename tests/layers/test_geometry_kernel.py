@@ -12,7 +12,7 @@ from tests.golden import case_id, golden_modules, load_module_case, options
 from tests.golden_compare import compare
 from tests.layers.batch_bugs import EXAMPLES, like_the_reference
 from tflane_jax.convert.bevformer import SPATIAL_ATTENTION
-from tflane_jax.layers.bev_attention import LOST
+from tflane_jax.layers.camera_queries import LOST
 from tflane_jax.layers.geometry_kernel import GeometryKernelAttention, kernel_offsets
 
 

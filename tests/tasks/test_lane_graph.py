@@ -29,7 +29,7 @@ from tflane_jax.errors import UserError
 from tflane_jax.evaluation.lane_groups import LANE_GROUPS
 from tflane_jax.evaluation.results import EvaluationConfig
 from tflane_jax.geometry import BevGrid, PerceptionRange
-from tflane_jax.layers.bev_attention import LOST
+from tflane_jax.layers.camera_queries import LOST
 from tflane_jax.limits import SettingError
 from tflane_jax.markers.simulation import MarkerConfig
 from tflane_jax.models.area_decoder import AreaDecoderConfig

@@ -11,13 +11,11 @@ from typing import Any
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
+from tflane_jax.layers.camera_queries import CameraQueries
 from tflane_jax.layers.deformable import cell_units, offsets_and_logits
 from tflane_jax.layers.sampling import deformable_attention
-
-LOST = "lost"
-"""Collection of numbers of what a layer leaves out; they are counted only where a caller makes it mutable."""
 
 _INIT = nn.initializers.xavier_uniform()
 
@@ -80,7 +78,7 @@ class SpatialCrossAttention(nn.Module):
         heads, points: sampling points per head and level, divided among the anchors of a pillar.
         capacity: most queries per camera, to skip those that a camera does not see; None evaluates all queries in all
             cameras, with the same result if the capacity suffices. Beyond it, the last queries of the grid do without
-            that camera; their number is sown as `camera_cells` into the collection `LOST`.
+            that camera; their number is sown (`CameraQueries.sow_lost`).
         dtype: of the projections.
     """
 
@@ -108,47 +106,18 @@ class SpatialCrossAttention(nn.Module):
             reference: (x, y) of a query's Z anchors in each image, in [0, 1].
             visible: anchors inside the image.
         """
-        heads, (cameras, queries) = self.heads, reference.shape[:2]
+        cameras, heads = len(features), self.heads
         value = nn.Dense(self.dim, kernel_init=_INIT, dtype=self.dtype, name="value_proj")(features)
         value = value.reshape(cameras, -1, heads, self.dim // heads).astype(jnp.float32)
         offsets, logits = offsets_and_logits(query, heads, len(shapes), self.points, self.dtype)
         weights = jax.nn.softmax(logits, (-2, -1))
         offsets = offsets * cell_units(shapes)[None, None, :, None]
-        seen = visible.any(-1)
-        if self.capacity is None or self.capacity >= queries:
-            around = jax.vmap(_around_anchors, in_axes=(0, None))(reference, offsets)
-            # Unseen queries have weight 0, so that their gradients are zero.
-            taken = jnp.where(seen[:, :, None, None, None], weights[None], 0.0)
-            total, served = deformable_attention(value, shapes, around, taken).sum(0), seen.sum(0)
-        else:
-            index = first_seen(seen, self.capacity)
-            if not self.is_initializing():
-                self.sow(LOST, "camera_cells", jnp.maximum(seen.sum(1) - self.capacity, 0).sum())
-            pick = jnp.minimum(index, queries - 1)
-            by_camera = jnp.take_along_axis(reference, pick[:, :, None, None], 1)
-            around = jax.vmap(_around_anchors)(by_camera, offsets[pick])
-            taken = jnp.where((index < queries)[:, :, None, None, None], weights[pick], 0.0)
-            found = deformable_attention(value, shapes, around, taken)
-            total = jnp.zeros((queries, self.dim), found.dtype)
-            total = total.at[index.reshape(-1)].add(found.reshape(-1, self.dim), mode="drop")
-            served = times_listed(index, queries)
-        mean = total / jnp.maximum(served, 1)[:, None].astype(total.dtype)
-        return nn.Dense(self.dim, kernel_init=_INIT, dtype=self.dtype, name="output_proj")(mean)
-
-
-def times_listed(index: Int[Array, "v capacity"], queries: int) -> Int[Array, " q"]:
-    """Return in how many rows of `first_seen` each of the Q queries stands."""
-    return jnp.zeros(queries, jnp.int32).at[index.reshape(-1)].add(1, mode="drop")
-
-
-def first_seen(seen: Bool[Array, "v q"], capacity: int) -> Int[Array, "v capacity"]:
-    """Return the indices of the first queries that each camera sees, ascending, filled up with Q."""
-    cameras, queries = seen.shape
-    place = jnp.cumsum(seen, 1) - 1
-    place = jnp.where(seen, place, capacity)
-    camera = jnp.broadcast_to(jnp.arange(cameras)[:, None], place.shape)
-    query = jnp.broadcast_to(jnp.arange(queries, dtype=jnp.int32)[None], place.shape)
-    return jnp.full((cameras, capacity), queries, jnp.int32).at[camera, place].set(query, mode="drop")
+        by_camera = CameraQueries.of(visible.any(-1), self.capacity)
+        by_camera.sow_lost(self)
+        around = jax.vmap(_around_anchors)(by_camera.take_own(reference), by_camera.take(offsets))
+        # Unseen queries have weight 0, so that their gradients are zero.
+        found = deformable_attention(value, shapes, around, by_camera.masked(by_camera.take(weights)))
+        return nn.Dense(self.dim, kernel_init=_INIT, dtype=self.dtype, name="output_proj")(by_camera.mean(found))
 
 
 def _around_anchors(

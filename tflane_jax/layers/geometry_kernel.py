@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from tflane_jax.layers.bev_attention import LOST, first_seen, times_listed
+from tflane_jax.layers.camera_queries import CameraQueries
 
 _INIT = nn.initializers.xavier_uniform()
 
@@ -68,24 +68,12 @@ class GeometryKernelAttention(nn.Module):
         # attentions.
         logits = nn.Dense(heads * rows * columns, kernel_init=_INIT, dtype=self.dtype, name="attention_weights")(query)
         weights = jax.nn.softmax(logits.reshape(queries, heads, rows * columns).astype(jnp.float32), -1)
-        seen = visible.any(-1)
-        if self.capacity is None or self.capacity >= queries:
-            # Unseen queries have weight 0, so that their gradients are zero; their reference may be anything.
-            taken = jnp.where(seen[:, :, None, None], weights[None], 0.0)
-            around = jnp.where(seen[:, :, None, None], reference, 0.0)
-            total, served = kernel_sum(value, shapes[0], around, taken, self.kernel).sum(0), seen.sum(0)
-        else:
-            index = first_seen(seen, self.capacity)
-            if not self.is_initializing():
-                self.sow(LOST, "camera_cells", jnp.maximum(seen.sum(1) - self.capacity, 0).sum())
-            pick, there = jnp.minimum(index, queries - 1), (index < queries)[:, :, None, None]
-            around = jnp.where(there, jnp.take_along_axis(reference, pick[:, :, None, None], 1), 0.0)
-            found = kernel_sum(value, shapes[0], around, jnp.where(there, weights[pick], 0.0), self.kernel)
-            total = jnp.zeros((queries, self.dim), found.dtype)
-            total = total.at[index.reshape(-1)].add(found.reshape(-1, self.dim), mode="drop")
-            served = times_listed(index, queries)
-        mean = total / jnp.maximum(served, 1)[:, None].astype(total.dtype)
-        return nn.Dense(self.dim, kernel_init=_INIT, dtype=self.dtype, name="output_proj")(mean)
+        by_camera = CameraQueries.of(visible.any(-1), self.capacity)
+        by_camera.sow_lost(self)
+        # Unseen queries have weight 0, so that their gradients are zero; their reference may be anything.
+        around, taken = by_camera.masked(by_camera.take_own(reference)), by_camera.masked(by_camera.take(weights))
+        found = kernel_sum(value, shapes[0], around, taken, self.kernel)
+        return nn.Dense(self.dim, kernel_init=_INIT, dtype=self.dtype, name="output_proj")(by_camera.mean(found))
 
 
 def kernel_sum(

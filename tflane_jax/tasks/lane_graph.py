@@ -29,7 +29,7 @@ from tflane_jax.evaluation.lane_graph import evaluate_lanes
 from tflane_jax.evaluation.results import Evaluation, EvaluationConfig
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.layers.batch_norm import BATCH_AXIS, STATISTICS
-from tflane_jax.layers.bev_attention import LOST
+from tflane_jax.layers.camera_queries import LOST
 from tflane_jax.limits import Count, SettingError
 from tflane_jax.losses.common import HostLossConfig, checked_loss
 from tflane_jax.losses.toponet import TopoNetLossConfig

@@ -78,7 +78,7 @@ class TrainingConfig:
         best_metric: score of the evaluation that chooses the best checkpoint; higher is better.
         init_from: folder of a run whose best averaged parameters to start from (fine-tuning), each seed from itself if
             the run has it; `{seed}` in it is replaced by the seed. None starts from random parameters.
-        init_partly: whether the model of `init_from` may have other modules; those it lacks start from random parameters.
+        init_partly: whether the model of `init_from` may have other modules; what it lacks starts at random.
     """
 
     steps: Count = 10_000

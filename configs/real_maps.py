@@ -14,9 +14,8 @@ Generated roads are those of the preset `real-like`, which was fitted to mean st
 from dataclasses import replace
 
 from tflane_jax.config import RealMapData, RunConfig, load_config
+from tflane_jax.config_io import with_setting
 from tflane_jax.models.raster_fusion import TrafficRasterConfig
-from tflane_jax.models.toponet import TopoNetConfig
-from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.world.presets import CITY, REAL_LIKE
 
 # Recorded frames hold twice as many lanes as those of `city`, for which the host has 48 queries and 36 proposals.
@@ -48,20 +47,10 @@ def ablations() -> dict[str, RunConfig]:
 
 
 def _on(data: RealMapData, host: str) -> RunConfig:
-    config = load_config(host)
-    assert isinstance(config.task, LaneGraphTask)
-    assert isinstance(config.task.model, TopoNetConfig)
-    decoder = config.task.model.decoder
-    assert decoder.proposals is not None
-    decoder = replace(decoder, queries=QUERIES, proposals=replace(decoder.proposals, count=PROPOSALS))
-    return replace(config, data=data, task=replace(config.task, model=replace(config.task.model, decoder=decoder)))
+    config = with_setting(load_config(host), "data", data)
+    config = with_setting(config, "task.model.decoder.queries", QUERIES)
+    return with_setting(config, "task.model.decoder.proposals.count", PROPOSALS)
 
 
 def _with_bev(config: RunConfig) -> RunConfig:
-    assert isinstance(config.task, LaneGraphTask)
-    assert isinstance(config.task.model, TopoNetConfig)
-    model = config.task.model
-    assert model.priors.traffic_flow is not None
-    traffic_flow = replace(model.priors.traffic_flow, bev=TrafficRasterConfig())
-    model = replace(model, priors=replace(model.priors, traffic_flow=traffic_flow))
-    return replace(config, task=replace(config.task, model=model))
+    return with_setting(config, "task.model.priors.traffic_flow.bev", TrafficRasterConfig())

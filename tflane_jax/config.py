@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from tflane_jax.config_files import find_config, is_shipped, split_reference
-from tflane_jax.config_io import part_classes
+from tflane_jax.config_io import part_classes, with_setting
 from tflane_jax.datasets.argoverse2 import LogData
 from tflane_jax.datasets.front_views import FrontViewData
 from tflane_jax.datasets.nuscenes import NuScenesData
@@ -225,21 +225,16 @@ def with_priors_of(other: RunConfig, config: RunConfig) -> RunConfig:
     """Return a configuration whose host has the priors of the host of another one."""
     if not isinstance(other.task, LaneGraphTask) or not isinstance(config.task, LaneGraphTask):
         raise UserError("only models of lanes around the vehicle have priors")
-    model = dataclasses.replace(config.task.model, priors=other.task.model.priors)
-    return dataclasses.replace(config, task=dataclasses.replace(config.task, model=model))
+    return with_setting(config, "task.model.priors", other.task.model.priors)
 
 
 def with_remat(config: RunConfig, precision: Precision = "float32") -> RunConfig:
     """Return a configuration whose camera encoder recomputes activations in the backward pass, in some precision."""
     if not isinstance(config.task, LaneGraphTask) or not isinstance(config.task.model.encoder, CameraEncoderConfig):
         raise UserError("only models with a camera encoder have its settings remat and precision")
-    model = config.task.model
-    parts = {
-        name: dataclasses.replace(getattr(model.encoder, name), remat=True, precision=precision)
-        for name in ("images", "bev")
-    }
-    model = dataclasses.replace(model, encoder=dataclasses.replace(model.encoder, **parts))
-    return dataclasses.replace(config, task=dataclasses.replace(config.task, model=model))
+    for part in ("task.model.encoder.images", "task.model.encoder.bev"):
+        config = with_setting(with_setting(config, f"{part}.remat", True), f"{part}.precision", precision)
+    return config
 
 
 def epochs_of(config: RunConfig) -> int:

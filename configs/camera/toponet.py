@@ -10,6 +10,7 @@
 from dataclasses import replace
 
 from tflane_jax.config import RunConfig, WorldData
+from tflane_jax.config_io import with_setting
 from tflane_jax.datasets.base import ExampleConfig
 from tflane_jax.geometry import BevGrid, PerceptionRange
 from tflane_jax.layers.fpn import FeaturePyramidConfig
@@ -62,5 +63,4 @@ def get_config() -> RunConfig:
 
 def ablations() -> dict[str, RunConfig]:
     """Return the model without denoising queries."""
-    config = get_config()
-    return {"plain": replace(config, task=replace(config.task, model=replace(config.task.model, denoising=None)))}
+    return {"plain": with_setting(get_config(), "task.model.denoising", None)}

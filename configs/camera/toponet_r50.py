@@ -20,6 +20,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from tflane_jax.config import OpenLaneV2Data, RunConfig
+from tflane_jax.config_io import with_setting
 from tflane_jax.datasets.photometric import TOPONET_PHOTOMETRIC
 from tflane_jax.losses.toponet import TopoNetLossConfig
 from tflane_jax.losses.traffic_elements import ElementLossConfig
@@ -52,12 +53,9 @@ def get_config() -> RunConfig:
 def ablations() -> dict[str, RunConfig]:
     """Return variants of the encoder, and the published weights' inputs."""
     config = get_config()
-    task = config.task
-    assert isinstance(config.data, OpenLaneV2Data)
-    assert isinstance(task, LaneGraphTask)
 
     def with_encoder(encoder: CameraEncoderConfig) -> RunConfig:
-        return replace(config, task=replace(task, model=replace(task.model, encoder=encoder)))
+        return with_setting(config, "task.model.encoder", encoder)
 
     images, bev = replace(ENCODER.images, remat=True), replace(ENCODER.bev, remat=True)
     alone = replace(ENCODER, bev=replace(ENCODER.bev, memory="off", motion="can_bus", image_size="first"))
@@ -66,5 +64,5 @@ def ablations() -> dict[str, RunConfig]:
         "remat": with_encoder(CameraEncoderConfig(images, bev)),
         "bfloat16": with_encoder(CameraEncoderConfig(*half)),
         "six_layers": with_encoder(replace(ENCODER, bev=replace(ENCODER.bev, layers=6))),
-        "published_weights": replace(with_encoder(alone), data=replace(config.data, can_bus="reference")),
+        "published_weights": with_setting(with_encoder(alone), "data.can_bus", "reference"),
     }

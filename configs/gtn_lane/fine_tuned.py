@@ -17,6 +17,7 @@ import dataclasses
 from pathlib import Path
 
 from tflane_jax.config import EvaluationConfig, FrontViewData, RunConfig, load_config, with_restarts
+from tflane_jax.config_io import with_setting
 from tflane_jax.models.graph_encoders import GcnEncoderConfig, GtnEncoderConfig, HanEncoderConfig
 from tflane_jax.models.lstr import TransformerEncoderConfig
 from tflane_jax.training.loop import TrainingConfig
@@ -46,9 +47,6 @@ def get_config() -> RunConfig:
 
 def ablations() -> dict[str, RunConfig]:
     """Return every encoder with one cosine, and with Eq. (2) and the adaptive rule."""
-    configs = {}
-    for name, encoder in ENCODERS.items():
-        config = get_config()
-        model = dataclasses.replace(config.task.model, encoder=encoder)
-        configs[name] = dataclasses.replace(config, task=dataclasses.replace(config.task, model=model))
+    lstr = get_config()
+    configs = {name: with_setting(lstr, "task.model.encoder", encoder) for name, encoder in ENCODERS.items()}
     return configs | {f"{name}_restarts": with_restarts(config) for name, config in configs.items()}

@@ -8,15 +8,14 @@ still give the same lanes for every image (docs/gtn_lane.md).
 Everything except the encoder is that of `transformer.py`.
 """
 
-import dataclasses
 from pathlib import Path
 
 from tflane_jax.config import RunConfig, load_config
+from tflane_jax.config_io import with_setting
 from tflane_jax.models.graph_encoders import GtnEncoderConfig
 
 
 def get_config() -> RunConfig:
     """Return the baseline with this encoder."""
     baseline = load_config(str(Path(__file__).with_name("transformer.py")))
-    model = dataclasses.replace(baseline.task.model, encoder=GtnEncoderConfig(dropout=0.0))
-    return dataclasses.replace(baseline, task=dataclasses.replace(baseline.task, model=model))
+    return with_setting(baseline, "task.model.encoder", GtnEncoderConfig(dropout=0.0))

@@ -27,35 +27,31 @@ import dataclasses
 from pathlib import Path
 
 from tflane_jax.config import RunConfig, TuSimpleData, load_config, with_restarts
+from tflane_jax.config_io import with_setting
 from tflane_jax.models.graph_encoders import GcnEncoderConfig, GtnEncoderConfig, HanEncoderConfig
-from tflane_jax.models.lstr import EncoderConfig
 
 LSTR = str(Path(__file__).with_name("lstr.py"))
+ENCODER = "task.model.encoder"
 GTN = GtnEncoderConfig(heads=2)
 
 
 def get_config() -> RunConfig:
     """Return LSTR's network and recipe with the GTN encoder."""
-    return with_encoder(load_config(LSTR), GTN)
+    return with_setting(load_config(LSTR), ENCODER, GTN)
 
 
 def ablations() -> dict[str, RunConfig]:
     """Return other learning rates and other encoders."""
-    encoders = {"gcn": GcnEncoderConfig(), "han": HanEncoderConfig()}
     lstr = load_config(LSTR)
+    encoders = {"gcn": GcnEncoderConfig(), "han": HanEncoderConfig()}
+    others = {name: with_setting(lstr, ENCODER, encoder) for name, encoder in encoders.items()}
     return {
         "restarts": held_out(with_restarts(get_config(), cycles=5)),
-        **{name: with_encoder(lstr, encoder) for name, encoder in encoders.items()},
+        **others,
         "fine_tuned": fine_tuned(get_config()),
-        **{f"{name}_fine_tuned": fine_tuned(with_encoder(lstr, encoder)) for name, encoder in encoders.items()},
+        **{f"{name}_fine_tuned": fine_tuned(config) for name, config in others.items()},
         "transformer_fine_tuned": fine_tuned(lstr),
     }
-
-
-def with_encoder(config: RunConfig, encoder: EncoderConfig) -> RunConfig:
-    """Return a configuration with another encoder."""
-    model = dataclasses.replace(config.task.model, encoder=encoder)
-    return dataclasses.replace(config, task=dataclasses.replace(config.task, model=model))
 
 
 def fine_tuned(config: RunConfig) -> RunConfig:

@@ -8,10 +8,10 @@ Everything except the encoder is that of `transformer.py`. The ablation `meta_pa
 single relations.
 """
 
-import dataclasses
 from pathlib import Path
 
 from tflane_jax.config import RunConfig, load_config
+from tflane_jax.config_io import with_setting
 from tflane_jax.models.graph_encoders import HanEncoderConfig
 
 
@@ -31,5 +31,4 @@ def ablations() -> dict[str, RunConfig]:
 def with_encoder(encoder: HanEncoderConfig) -> RunConfig:
     """Return the baseline with an encoder."""
     baseline = load_config(str(Path(__file__).with_name("transformer.py")))
-    model = dataclasses.replace(baseline.task.model, encoder=encoder)
-    return dataclasses.replace(baseline, task=dataclasses.replace(baseline.task, model=model))
+    return with_setting(baseline, "task.model.encoder", encoder)

@@ -5,9 +5,8 @@
     tflane train --config gtn_lane/table1:gtn_restarts
 
 Networks and data are those of `transformer.py`, `gtn.py`, `gcn.py` and `han.py`, whose 4,000 steps end before every run
-has left its first plateau. After 10,000 steps validation is flat (docs/gtn_lane.md). So that more steps take no longer,
-the backbone's last stage has one block of 64 channels instead of two of 128: those are a quarter of a step. Every row
-has the same backbone.
+has left its first plateau. After 10,000 steps validation is flat (docs/gtn_lane.md). To save time, the backbone's last
+stage has, in every row, one block of 64 channels instead of two of 128, which take a quarter of a step.
 
 An ablation NAME has one cosine over the run; `NAME_restarts` has the paper's Eq. (2) instead: three cycles, each twice
 as long as the one before, where none is extended; an extension of the first leaves room for two. The adaptive rule
@@ -17,9 +16,9 @@ else differs between them.
 
 import dataclasses
 from pathlib import Path
-from typing import Any
 
 from tflane_jax.config import RunConfig, load_config, with_restarts
+from tflane_jax.config_io import with_setting
 
 FOLDER, STEPS = Path(__file__).parent, 10_000
 ENCODERS = {
@@ -45,9 +44,8 @@ def ablations() -> dict[str, RunConfig]:
 def longer(file: str) -> RunConfig:
     """Return a configuration of this folder with more, and faster, steps."""
     config = load_config(str(FOLDER / file))
-    network: Any = config.task.model
-    backbone = dataclasses.replace(network.backbone, blocks=(1, 2, 2, 1), channels=(16, 32, 64, 64))
-    model = dataclasses.replace(network, backbone=backbone)
+    config = with_setting(config, "task.model.backbone.blocks", (1, 2, 2, 1))
+    config = with_setting(config, "task.model.backbone.channels", (16, 32, 64, 64))
     # A restart needs four evaluations after the first quarter of a cycle; the first cycle has 1,414 steps.
     training = dataclasses.replace(config.training, steps=STEPS, eval_every=200)
-    return dataclasses.replace(config, task=dataclasses.replace(config.task, model=model), training=training)
+    return dataclasses.replace(config, training=training)

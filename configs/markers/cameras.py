@@ -56,12 +56,10 @@ def get_config() -> RunConfig:
 def ablations() -> dict[str, RunConfig]:
     """Return the other rows of the table, gated fusion without memory of markers, and rows without memory of BEV."""
     config = get_config()
-    assert isinstance(config.task, LaneGraphTask)
     markers = SMALL_MARKER_FUSION
 
     def with_markers(changed: MarkerFusionConfig | None) -> RunConfig:
-        model = replace(config.task.model, priors=PriorsConfig(markers=changed))
-        return replace(config, task=replace(config.task, model=model))
+        return with_setting(config, "task.model.priors", PriorsConfig(markers=changed))
 
     def alone(row: RunConfig) -> RunConfig:
         """Return the row without memory of BEV features, as the host was trained."""

@@ -16,14 +16,13 @@ from dataclasses import replace
 from pathlib import Path
 
 from tflane_jax.config import RunConfig, WorldData, load_config
+from tflane_jax.config_io import with_setting
 from tflane_jax.datasets.base import ExampleConfig
 from tflane_jax.evaluation.results import EvaluationConfig
 from tflane_jax.losses.bevformer_detr import BevFormerDetrLossConfig
 from tflane_jax.losses.toponet import TopoNetLossConfig
 from tflane_jax.markers.simulation import MarkerConfig, MarkerSimulationConfig
 from tflane_jax.models.bevformer_detr import BevFormerDetrConfig
-from tflane_jax.models.evidence_encoder import EvidenceEncoderConfig
-from tflane_jax.models.lanesegnet import LaneSegNetConfig
 from tflane_jax.models.toponet import TopoNetConfig
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.world.cameras.ring import ARGOVERSE2_RING
@@ -44,11 +43,7 @@ STEPS = 4000
 
 def get_config() -> RunConfig:
     """Return TopoNet."""
-    config = _trained("toponet.py", DATA)
-    assert isinstance(config.task, LaneGraphTask)
-    model = config.task.model
-    assert isinstance(model, TopoNetConfig)
-    return replace(config, task=replace(config.task, model=replace(model, encoder=_encoder(model.encoder))))
+    return with_setting(_trained("toponet.py", DATA), "task.model.encoder.dilations", (1,))
 
 
 def ablations() -> dict[str, RunConfig]:
@@ -67,13 +62,9 @@ def ablations() -> dict[str, RunConfig]:
         points_weight=losses.points_weight, successor_weight=losses.successor_weight, class_target=losses.class_target
     )
     lanesegnet = _trained("lanesegnet.py", replace(DATA, example=replace(EXAMPLE, crossings="sides")))
-    assert isinstance(lanesegnet.task, LaneGraphTask)
-    segments = lanesegnet.task.model
-    assert isinstance(segments, LaneSegNetConfig)
-    model = replace(segments, encoder=toponet.encoder)
     return {
         "bevformer_detr": replace(config, task=LaneGraphTask(baseline, baseline_losses)),
-        "lanesegnet": replace(lanesegnet, task=replace(lanesegnet.task, model=model)),
+        "lanesegnet": with_setting(lanesegnet, "task.model.encoder", toponet.encoder),
     }
 
 
@@ -82,8 +73,3 @@ def _trained(file: str, data: WorldData) -> RunConfig:
     config = load_config(str(RECIPE / file))
     training = replace(config.training, steps=STEPS, eval_every=2000)
     return replace(config, data=data, training=training, evaluation=EvaluationConfig(versions=("v2.1", "v1.0")))
-
-
-def _encoder(config: object) -> EvidenceEncoderConfig:
-    assert isinstance(config, EvidenceEncoderConfig)
-    return replace(config, dilations=(1,))

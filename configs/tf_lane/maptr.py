@@ -14,6 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from tflane_jax.config import RunConfig, WorldData, load_config
+from tflane_jax.config_io import with_setting
 from tflane_jax.datasets.map_lines import MapLinesConfig
 from tflane_jax.losses.maptr import MapTrLossConfig
 from tflane_jax.models.map_lines import LineDecoderConfig
@@ -30,10 +31,7 @@ LOSSES = MapTrLossConfig(class_target="quality", least_step=0.1)
 
 def get_config() -> RunConfig:
     """Return the baseline on the preset `city`."""
-    city = _map_lines("toponet.py")
-    assert isinstance(city.task, LaneGraphTask)
-    decoder = replace(DECODER, queries=CITY_QUERIES)
-    return replace(city, task=replace(city.task, model=replace(city.task.model, decoder=decoder)))
+    return with_setting(_map_lines("toponet.py"), "task.model.decoder.queries", CITY_QUERIES)
 
 
 def ablations() -> dict[str, RunConfig]:

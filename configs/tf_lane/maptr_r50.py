@@ -22,6 +22,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from tflane_jax.config import NuScenesData, RunConfig, WorldData, with_remat
+from tflane_jax.config_io import with_setting
 from tflane_jax.datasets.base import ExampleConfig
 from tflane_jax.datasets.map_lines import MapLinesConfig
 from tflane_jax.datasets.nuscenes_scenes import NUSCENES_SIZES
@@ -69,8 +70,7 @@ def ablations() -> dict[str, RunConfig]:
     config, encoder = get_config(), PAPER_MAP_ENCODER
 
     def with_encoder(encoder: CameraEncoderConfig) -> RunConfig:
-        task = replace(config.task, model=replace(paper_config(), encoder=encoder))
-        return replace(config, task=task)
+        return with_setting(config, "task.model.encoder", encoder)
 
     return {
         "bevformer": with_encoder(replace(encoder, bev=replace(encoder.bev, attention="deformable"))),
@@ -102,6 +102,4 @@ NUSCENES = NuScenesData(
 
 def _published(config: RunConfig) -> RunConfig:
     """Return a configuration on nuScenes in the lidar's axes."""
-    assert isinstance(config.task, LaneGraphTask)
-    task = replace(config.task, model=replace(config.task.model, axes="lidar"))
-    return replace(config, task=task, data=NUSCENES)
+    return with_setting(with_setting(config, "task.model.axes", "lidar"), "data", NUSCENES)

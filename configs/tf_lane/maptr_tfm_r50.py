@@ -10,10 +10,10 @@ Host, images, labels and recipe are those of `maptr_r50:published_weights`, modu
 pass, `:bfloat16` does so in half precision; `:host` is the baseline without the module.
 """
 
-from dataclasses import replace
 from pathlib import Path
 
-from tflane_jax.config import NuScenesData, RunConfig, epochs_of, load_config, with_epochs, with_priors_of, with_remat
+from tflane_jax.config import RunConfig, epochs_of, load_config, with_epochs, with_priors_of, with_remat
+from tflane_jax.config_io import with_setting
 
 HERE = Path(__file__)
 HOST = str(HERE.with_name("maptr_r50.py:published_weights"))
@@ -23,9 +23,7 @@ EPOCHS = epochs_of(load_config(str(HERE.with_name("toponet_tfm_r50.py"))))
 def get_config() -> RunConfig:
     """Return the paper's host with the module."""
     config = with_priors_of(load_config(str(HERE.with_name("toponet_tfm_r50.py"))), load_config(HOST))
-    assert isinstance(config.data, NuScenesData)
-    config = replace(config, data=replace(config.data, example=replace(config.data.example, history_hz=2.0)))
-    return with_epochs(config, EPOCHS)
+    return with_epochs(with_setting(config, "data.example.history_hz", 2.0), EPOCHS)
 
 
 def ablations() -> dict[str, RunConfig]:

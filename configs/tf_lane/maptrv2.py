@@ -17,7 +17,8 @@ drove along 70.5 ± 2.1 percent, with masks in BEV of three cells; they are five
 from dataclasses import fields, replace
 from pathlib import Path
 
-from tflane_jax.config import LogData, RunConfig, WorldData, load_config
+from tflane_jax.config import RunConfig, load_config
+from tflane_jax.config_io import with_setting
 from tflane_jax.datasets.map_lines import MapLinesConfig
 from tflane_jax.losses.maptr import MapTrLossConfig
 from tflane_jax.losses.maptrv2 import MapTrV2LossConfig
@@ -43,29 +44,23 @@ def ablations() -> dict[str, RunConfig]:
 
 
 def _with_centerlines(config: RunConfig) -> RunConfig:
-    assert isinstance(config.data, WorldData)
-    assert config.data.example.map_lines is not None
-    lines = replace(config.data.example.map_lines, centerlines="include")
-    data = replace(config.data, example=replace(config.data.example, map_lines=lines))
-    return replace(_with_decoder(config, classes=4, queries=CENTERLINE_QUERIES), data=data)
+    config = with_setting(config, "data.example.map_lines.centerlines", "include")
+    return _with_decoder(config, classes=4, queries=CENTERLINE_QUERIES)
 
 
 def _with_heights() -> RunConfig:
     config, logs = get_config(), load_config(str(Path(__file__).with_name("argoverse2.py")))
-    assert isinstance(logs.data, LogData)
-    example = replace(logs.data.example, map_lines=MapLinesConfig())
+    data = with_setting(logs.data, "example.map_lines", MapLinesConfig())
     training = replace(logs.training, best_metric=config.training.best_metric)
-    config = replace(config, data=replace(logs.data, example=example), training=training)
+    config = replace(config, data=data, training=training)
     return replace(_with_decoder(config, coordinates=3, queries=48), optim=replace(config.optim, warmup_steps=10))
 
 
 def _with_decoder(config: RunConfig, *, queries: int, **changes: int) -> RunConfig:
     """Return a configuration with another decoder, and as many queries in the second group as in the first."""
-    assert isinstance(config.task, LaneGraphTask)
-    assert isinstance(config.task.model, MapTrV2Config)
-    decoder = replace(config.task.model.decoder, queries=queries, **changes)
-    model = replace(config.task.model, decoder=decoder, many=queries)
-    return replace(config, task=replace(config.task, model=model))
+    for name, value in {"queries": queries, **changes}.items():
+        config = with_setting(config, f"task.model.decoder.{name}", value)
+    return with_setting(config, "task.model.many", queries)
 
 
 def _second_version(file: str) -> RunConfig:

@@ -26,6 +26,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from tflane_jax.config import NuScenesData, RunConfig, WorldData, load_config, with_remat
+from tflane_jax.config_io import with_setting
 from tflane_jax.datasets.map_lines import MapLinesConfig
 from tflane_jax.geometry import BevGrid
 from tflane_jax.losses.maptrv2 import MapTrV2LossConfig
@@ -46,14 +47,9 @@ AV2_EPOCH = 700 * 156 // 32
 
 def get_config() -> RunConfig:
     """Return the paper's configuration."""
-    config = load_config(MAPTR)
-    assert isinstance(config.data, WorldData)
-    example = config.data.example
-    assert example.cameras is not None
-    data = replace(config.data, example=replace(example, cameras=replace(example.cameras, depth_cell=CELL)))
-    assert isinstance(config.task, LaneGraphTask)
-    task = replace(config.task, model=paper_config(), losses=MapTrV2LossConfig())
-    return replace(config, task=task, data=data)
+    config = with_setting(load_config(MAPTR), "data.example.cameras.depth_cell", CELL)
+    config = with_setting(config, "task.model", paper_config())
+    return with_setting(config, "task.losses", MapTrV2LossConfig())
 
 
 def ablations() -> dict[str, RunConfig]:
@@ -70,14 +66,9 @@ def ablations() -> dict[str, RunConfig]:
 
 def _with_centerlines(config: RunConfig) -> RunConfig:
     """Return the published variant with the fourth class."""
-    assert isinstance(config.task, LaneGraphTask)
-    assert isinstance(config.task.model, MapTrV2Config)
-    assert isinstance(config.data, WorldData)
-    model = config.task.model
-    model = replace(model, decoder=replace(model.decoder, classes=4, queries=70))
-    example = replace(config.data.example, map_lines=MapLinesConfig(centerlines="include"))
-    task, data = replace(config.task, model=model), replace(config.data, example=example)
-    return replace(config, task=task, data=data)
+    config = with_setting(config, "data.example.map_lines", MapLinesConfig(centerlines="include"))
+    config = with_setting(config, "task.model.decoder.classes", 4)
+    return with_setting(config, "task.model.decoder.queries", 70)
 
 
 def _with_heights(config: RunConfig) -> RunConfig:

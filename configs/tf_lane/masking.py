@@ -9,14 +9,12 @@ The table, 2,500 updates, three seeds: recall of hidden lanes that vehicles drov
 49.6 ± 1.3; that a variant is better is not shown.
 """
 
-from dataclasses import replace
 from pathlib import Path
 
 from tflane_jax.config import RunConfig, load_config
-from tflane_jax.models.priors import PriorsConfig
-from tflane_jax.models.traffic_flow_module import ALL_FUSIONS
+from tflane_jax.config_io import with_setting
+from tflane_jax.models.traffic_flow_module import ALL_FUSIONS, LANE_FUSIONS, Fusion
 from tflane_jax.models.traffic_masks import TrafficMaskConfig
-from tflane_jax.tasks.lane_graph import LaneGraphTask
 
 FAR = 1000.0
 
@@ -29,9 +27,9 @@ def get_config() -> RunConfig:
 def ablations() -> dict[str, RunConfig]:
     """Return the variants by name; distances are between the reference of a lane query and a track."""
     return {
-        "all": _masked(TrafficMaskConfig(), "all"),
+        "all": _masked(TrafficMaskConfig(), ALL_FUSIONS),
         "joint": _masked(TrafficMaskConfig(softmax="joint")),
-        "joint_all": _masked(TrafficMaskConfig(softmax="joint"), "all"),
+        "joint_all": _masked(TrafficMaskConfig(softmax="joint"), ALL_FUSIONS),
         "heads": _masked(TrafficMaskConfig(head_windows=(4.0, 8.0, 16.0, FAR))),
         "window": _masked(TrafficMaskConfig(window=6.0)),
         "nearest": _masked(TrafficMaskConfig(nearest=4)),
@@ -39,12 +37,6 @@ def ablations() -> dict[str, RunConfig]:
     }
 
 
-def _masked(masking: TrafficMaskConfig, pipe: str = "lanes") -> RunConfig:
-    config = get_config()
-    assert isinstance(config.task, LaneGraphTask)
-    flow = config.task.model.priors.traffic_flow
-    assert flow is not None
-    module = replace(flow.module, masking=masking)
-    module = replace(module, fusions=ALL_FUSIONS) if pipe == "all" else module
-    priors = PriorsConfig(traffic_flow=replace(flow, module=module))
-    return replace(config, task=replace(config.task, model=replace(config.task.model, priors=priors)))
+def _masked(masking: TrafficMaskConfig, fusions: tuple[Fusion, ...] = LANE_FUSIONS) -> RunConfig:
+    module = "task.model.priors.traffic_flow.module"
+    return with_setting(with_setting(get_config(), f"{module}.masking", masking), f"{module}.fusions", fusions)

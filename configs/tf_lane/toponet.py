@@ -13,6 +13,7 @@ vehicles drove along 50.6 ± 1.3 percent.
 from dataclasses import replace
 
 from tflane_jax.config import RunConfig, WorldData
+from tflane_jax.config_io import with_setting
 from tflane_jax.losses.toponet import TopoNetLossConfig
 from tflane_jax.models.evidence_encoder import EvidenceEncoderConfig
 from tflane_jax.models.lane_denoising import DenoisingConfig
@@ -39,10 +40,10 @@ def ablations() -> dict[str, RunConfig]:
     data = WorldData.street()
     model = _host(data)
     street = _small(model, data, steps=7000)
-    losses, optim, decoder, encoder = street.task.losses, street.optim, model.decoder, model.encoder
+    optim, decoder, encoder = street.optim, model.decoder, model.encoder
 
     def changed(**changes) -> RunConfig:
-        return replace(street, task=replace(street.task, model=replace(model, **changes)))
+        return with_setting(street, "task.model", replace(model, **changes))
 
     without_context = replace(encoder, levels=(), dilations=(1, 2, 4, 1), coordinates=False)
     plain = replace(decoder, output="sigmoid", layers=3)
@@ -55,7 +56,7 @@ def ablations() -> dict[str, RunConfig]:
         "street_proposals": changed(decoder=replace(decoder, proposals=PROPOSALS)),
         "street_without_context": changed(encoder=without_context),
         "street_without_denoising": changed(denoising=None),
-        "street_class_one": replace(street, task=replace(street.task, losses=replace(losses, class_target="one"))),
+        "street_class_one": with_setting(street, "task.losses.class_target", "one"),
         "street_muon_dense": replace(street, optim=replace(optim, muon_kernels="dense")),
         "street_adam": replace(street, optim=adam),
         "street_plain": street_plain,

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Literal
 
 from tflane_jax.config import RunConfig, load_config
+from tflane_jax.config_io import with_setting
 from tflane_jax.models.priors import PriorsConfig
 from tflane_jax.models.raster_fusion import TrafficRasterConfig
 from tflane_jax.models.traffic_flow_module import (
@@ -88,5 +89,4 @@ def _data(instances: int, tolerance: int) -> RunConfig:
 
 def _with_traffic_flow(traffic_flow: TrafficFlowConfig, baseline_file: str = "toponet.py:street") -> RunConfig:
     baseline = load_config(str(Path(__file__).with_name(baseline_file)))
-    model = dataclasses.replace(baseline.task.model, priors=PriorsConfig(traffic_flow=traffic_flow))
-    return dataclasses.replace(baseline, task=dataclasses.replace(baseline.task, model=model))
+    return with_setting(baseline, "task.model.priors", PriorsConfig(traffic_flow=traffic_flow))

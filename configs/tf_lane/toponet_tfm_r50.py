@@ -11,13 +11,12 @@ Past frames come at 2 Hz, as key frames do. TF-Lane does not give the sizes of i
 here. It trains on 16 devices and gives no batch; here it is the host's.
 """
 
-from dataclasses import replace
 from pathlib import Path
 
-from tflane_jax.config import OpenLaneV2Data, RunConfig, load_ablations, load_config, with_epochs
+from tflane_jax.config import RunConfig, load_ablations, load_config, with_epochs
+from tflane_jax.config_io import with_setting
 from tflane_jax.models.priors import PriorsConfig
 from tflane_jax.models.traffic_flow_module import TrafficFlowConfig, TrafficFlowModuleConfig
-from tflane_jax.tasks.lane_graph import LaneGraphTask
 
 HOST = str(Path(__file__).parent.with_name("camera") / "toponet_r50.py")
 EPOCHS = 60
@@ -37,10 +36,7 @@ def ablations() -> dict[str, RunConfig]:
 
 def _with_traffic_flow(config: RunConfig) -> RunConfig:
     """Return a configuration on OpenLane-V2 with traffic flow."""
-    assert isinstance(config.task, LaneGraphTask)
-    assert isinstance(config.data, OpenLaneV2Data)
-    model = replace(config.task.model, priors=PriorsConfig(traffic_flow=TRAFFIC_FLOW))
-    data = replace(
-        config.data, tracks=Path("data/argoverse2"), example=replace(config.data.example, history_hz=2.0, tracks=128)
-    )
-    return with_epochs(replace(config, task=replace(config.task, model=model), data=data), EPOCHS)
+    config = with_setting(config, "task.model.priors", PriorsConfig(traffic_flow=TRAFFIC_FLOW))
+    config = with_setting(config, "data.tracks", Path("data/argoverse2"))
+    config = with_setting(config, "data.example.tracks", 128)
+    return with_epochs(with_setting(config, "data.example.history_hz", 2.0), EPOCHS)

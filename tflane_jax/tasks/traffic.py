@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
+from tflane_jax.config_io import with_setting
 from tflane_jax.errors import UserError
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 
@@ -18,9 +17,7 @@ def limit_instances(task: LaneGraphTask, count: int) -> LaneGraphTask:
         raise UserError("this run is a baseline without traffic flow: --max-instances has nothing to limit")
     if not 0 <= count <= traffic.prior.max_instances:
         raise UserError(f"--max-instances {count} is outside 0 to {traffic.prior.max_instances}, the model's slots")
-    limited = replace(traffic, prior=replace(traffic.prior, top_instances=count))
-    priors = replace(task.model.priors, traffic_flow=limited)
-    return replace(task, model=replace(task.model, priors=priors))
+    return with_setting(task, "model.priors.traffic_flow.prior.top_instances", count)
 
 
 def queries_only(task: LaneGraphTask) -> LaneGraphTask:
@@ -32,5 +29,4 @@ def queries_only(task: LaneGraphTask) -> LaneGraphTask:
     traffic = task.model.priors.traffic_flow
     if traffic is None or traffic.insert == "nowhere":
         raise UserError("this model takes no traffic flow into its queries (task.model.priors.traffic_flow.insert)")
-    priors = replace(task.model.priors, traffic_flow=replace(traffic, bev=None))
-    return replace(task, model=replace(task.model, priors=priors))
+    return with_setting(task, "model.priors.traffic_flow.bev", None)

@@ -8,6 +8,7 @@ from typing import Any
 
 from tflane_jax.ablations.declaration import Claim, Declaration
 from tflane_jax.config import RunConfig, load_config, loaded_once, with_step_counts
+from tflane_jax.config_io import with_setting
 from tflane_jax.config_overrides import apply_overrides
 
 
@@ -177,6 +178,5 @@ def shortened(config: RunConfig) -> RunConfig:
     data: Any = config.data  # every source of the tables counts its scenes or images by split
     model: Any = getattr(config.task, "model", None)
     if hasattr(getattr(model, "decoder", None), "layers"):
-        model = replace(model, decoder=replace(model.decoder, layers=1))
-        config = replace(config, task=replace(config.task, model=model))
+        config = with_setting(config, "task.model.decoder.layers", 1)
     return replace(config, data=replace(data, train=24, val=4, test=6), optim=optim, training=training)

@@ -6,13 +6,15 @@ from dataclasses import replace
 import pytest
 
 from tests.shared import ROOT
+from tests.training.stub import LineTask, line_arrays
+from tests.training.stub_run import OPTIM
 from tflane_jax import summary
 from tflane_jax.cli import main
 from tflane_jax.config import load_config
 from tflane_jax.convert.hosts import camera_shapes
 from tflane_jax.models.camera_encoder import CameraEncoderConfig
 from tflane_jax.models.parameters import split_statistics
-from tflane_jax.summary import parameter_counts, prediction_program, shapes_of_params, training_program
+from tflane_jax.summary import MIB, parameter_counts, prediction_program, shapes_of_params, training_program
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.training.step import UpdateForm
 
@@ -75,6 +77,20 @@ def test_the_marker_papers_full_size():
     ours, toponet = counts.values()
     assert sum(toponet.values()) == 62_812_675
     assert sum(ours.values()) == 66_716_163 == 62_812_675 + ours["marker_tokens"] + 3 * 263_680
+
+
+class Frames(LineTask):
+    """The stub as tasks of one frame are summarised."""
+
+    frames = 1
+
+
+def test_a_state_that_is_updated_in_its_place_counts_once():
+    """Regression: memory was that of two states, for a program around the update does not update in place."""
+    example = {name: values[0] for name, values in line_arrays().items()}
+    program = training_program(Frames(features=100_000), example, 1, OPTIM)
+    one = 4 * (example["x"].size + 1) * 100_000 / MIB
+    assert 4.0 < (program.memory - program.temporary) / one < 4.1  # parameters, their average and two moments
 
 
 def test_a_batch_in_parts_is_planned_as_it_is_trained(monkeypatch):

@@ -83,6 +83,8 @@ def replicated(tree: Any, mesh: Mesh | None) -> Any:
 
 
 def _put(leaf: Any, sharding: NamedSharding | None) -> Any:
+    if sharding is not None and isinstance(leaf, jax.Array) and leaf.sharding == sharding:
+        return leaf
     if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
         return jax.random.wrap_key_data(_put(jax.random.key_data(leaf), sharding))
     host = np.asarray(gathered(leaf))  # the array may be on all devices
@@ -132,8 +134,17 @@ def _on_every_device(leaf: jax.Array, mesh: Any) -> jax.Array:
 
 
 def of_one_process(tree: Any) -> Any:
-    """Return a tree that is on every device so that one process alone can work with it."""
-    return tree if processes.count() == 1 else replicated(tree, None)
+    """Return a tree that is on every device, whole or in parts, so that one process alone can save it.
+
+    Of several processes, each gets arrays of its host: a state that is in parts may not fit on one device.
+    """
+    return tree if processes.count() == 1 else jax.tree.map(_on_host, tree)
+
+
+def _on_host(leaf: Any) -> Any:
+    if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+        return jax.random.wrap_key_data(_on_host(jax.random.key_data(leaf)))
+    return np.asarray(gathered(leaf))
 
 
 def divided(rows: Any, mesh: Mesh | None) -> Any:

@@ -6,7 +6,8 @@ processes (persistent compilation cache), and takes as long as scipy at the size
 host: one call per step for every layer and example, because the callback receives `vmap`ped axes as batch axes and
 loops over them. A program with a host callback can be neither exported nor kept, so do not use it in prediction.
 
-Where a batch is divided among devices, each device (or its host) solves the problems of its own examples.
+Where a batch is divided among devices, each device (or its host) solves the problems of its own examples. "scipy" is
+refused where these devices are parts of one CPU: its callbacks wait for arrays that the threads they occupy would copy.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from tflane_jax.devices import DATA_AXIS
+from tflane_jax.errors import UserError
 
 Backend = Literal["scipy", "jax"]
 
@@ -50,7 +52,7 @@ def match(cost: Float[Array, "*b q n"], valid: Bool[Array, "*#b n"], backend: Ba
         valid: False for padding; its leading axes broadcast against those of the costs.
         backend: "scipy" runs on the host, "jax" on the device.
 
-    Raises ValueError for another backend.
+    Raises ValueError for another backend, UserError for "scipy" on several devices of one CPU.
     """
     if backend not in get_args(Backend):
         raise ValueError(f"backend is {backend!r}: it must be {' or '.join(map(repr, get_args(Backend)))}")
@@ -70,6 +72,8 @@ def _by_device(solve: Callable[[Any, Any], Any], cost: Float[Array, "*b q n"], v
     Left to itself, XLA would run the loops of all devices in step, with an exchange in every round.
     """
     devices = jax.sharding.get_abstract_mesh().shape.get(DATA_AXIS, 1)
+    if devices > 1 and solve is _on_host and jax.default_backend() == "cpu":
+        raise UserError("matcher 'scipy' may never return on several devices of one CPU: choose 'jax', or one device")
     if devices == 1 or cost.ndim == 2 or cost.shape[0] % devices:
         return solve(cost, valid)
     examples = jax.sharding.PartitionSpec(DATA_AXIS)

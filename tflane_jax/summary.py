@@ -71,7 +71,7 @@ def training_program(
     optimizer = make_optimizer(optim, steps)
     step = make_update_step(task, optim, steps, UpdateForm(accumulate=accumulate))
     state = jax.eval_shape(partial(init_state, task, optimizer), jax.random.key(0), shapes)
-    lowered = jax.jit(step).lower(state, shapes_of(shapes, batch_size))
+    lowered = step.lower(state, shapes_of(shapes, batch_size))
     program = _program("training step", batch_size, lowered, compiled)
     # XLA counts the operations of a loop once.
     if accumulate > 1:
@@ -79,7 +79,7 @@ def training_program(
     if not getattr(task, "loops", False):
         return program
     step = make_update_step(task.unrolled, optim, steps)
-    lowered = jax.jit(step).lower(state, shapes_of(shapes, batch_size))
+    lowered = step.lower(state, shapes_of(shapes, batch_size))
     return replace(program, gflop=_program(program.name, batch_size, lowered, False).gflop)
 
 

@@ -18,6 +18,7 @@ from unittest import mock
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from tests.models.cases import WITH_TRAFFIC, make_example
 from tests.parameters import random_params
@@ -50,12 +51,14 @@ def assignments(backend: str) -> list:
     return np.where(found.matched, found.query, -1).tolist()
 
 
-def refused() -> str:
-    try:
-        training_mesh(BATCH + 1)
-    except UserError as error:
-        return str(error)
-    return ""
+def refused() -> dict[str, str]:
+    """Return the messages about a batch that does not divide, and about a matcher that could wait for itself."""
+    said = {}
+    for name, ask in {"batch": lambda: training_mesh(BATCH + 1), "matcher": lambda: assignments("scipy")}.items():
+        with pytest.raises(UserError) as error:
+            ask()
+        said[name] = str(error.value)
+    return said
 
 
 class Line(LineTask):
@@ -192,7 +195,7 @@ def main() -> None:
     shared_by_turns(folder / "shared")
     facts = {
         "devices": jax.device_count(),
-        "assignments": {backend: assignments(backend) for backend in ("jax", "scipy")},
+        "assignments": assignments("jax"),
         "refused": refused(),
         "predicted": predicted(BATCH),
         "predicted by one": predicted(BATCH - 1),

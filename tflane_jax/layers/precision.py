@@ -1,8 +1,8 @@
 """Precision and memory of a part of a model: bfloat16 projections, activations computed again for the gradient.
 
 In bfloat16, linear layers and convolutions take bfloat16 inputs and kernels, and attention multiplies what they give.
-Parameters, residual sums, layer norms, softmax, sampling locations and the outputs of a part are float32. The backbone
-and the depth network keep bfloat16 between their layers.
+Parameters, biases and their gradients, residual sums, layer norms, softmax, sampling locations and the outputs of a
+part are float32. The backbone and the depth network keep bfloat16 between their layers.
 """
 
 from __future__ import annotations
@@ -76,7 +76,17 @@ def full(tree: T) -> T:
 
 def _in_half(call: Any, arguments: Any, settings: Any, context: Any) -> Any:
     module = context.module
-    if context.method_name == "__call__" and isinstance(module, nn.Dense | nn.Conv) and module.dtype is None:
-        # A module is frozen, but lives for one trace only.
-        object.__setattr__(module, "dtype", jnp.bfloat16)
-    return call(*arguments, **settings)
+    if context.method_name != "__call__" or not isinstance(module, nn.Dense | nn.Conv) or module.dtype is not None:
+        return call(*arguments, **settings)
+    # A module is frozen, but lives for one trace only.
+    object.__setattr__(module, "dtype", jnp.bfloat16)
+    object.__setattr__(module, "promote_dtype", _all_but_bias)
+    return call(*arguments, **settings).astype(jnp.bfloat16)
+
+
+def _all_but_bias(inputs: jax.Array, kernel: jax.Array, bias: jax.Array | None, *, dtype: Any) -> Any:
+    """Return what a layer computes with; its bias stays float32, for the gradient of a bias is a sum over all cells.
+
+    In bfloat16, such a sum stops growing where the next term is less than 1/256 of it.
+    """
+    return inputs.astype(dtype), kernel.astype(dtype), bias

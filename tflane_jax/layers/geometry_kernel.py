@@ -13,6 +13,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from tflane_jax.layers.camera_queries import CameraQueries
@@ -100,13 +101,18 @@ def kernel_sum(
     x, y = location[..., 0] * width, location[..., 1] * height
     first = np.arange(cameras, dtype=np.int32)[:, None, None] * cells
     head = np.arange(heads, dtype=np.int32)[None, None]
-    total: Any = jnp.zeros((1, 1, 1, 1), value.dtype)
-    # One term after the other: all K samples at once would be K times the result in memory.
-    for k, (column, row) in enumerate(kernel_offsets(kernel)):
+
+    # One term after the other, and gathered again for the gradient: all K samples at once are K times the result.
+    @jax.checkpoint
+    def add(total: Array, term: tuple[Array, Array]) -> tuple[Array, None]:
+        (column, row), weight = term
         at_x = jnp.clip(jnp.round(x + column), 0, width - 1).astype(jnp.int32)
         at_y = jnp.clip(jnp.round(y + row), 0, height - 1).astype(jnp.int32)
         here = (first + at_y * width + at_x) * heads + head
-        total = total + table.at[here].get(mode="promise_in_bounds") * weights[..., k, None]
+        return total + table.at[here].get(mode="promise_in_bounds") * weight[..., None], None
+
+    terms = jnp.asarray(kernel_offsets(kernel), jnp.float32), jnp.moveaxis(weights, -1, 0)
+    total, _ = lax.scan(add, jnp.zeros((*location.shape[:3], depth), value.dtype), terms)
     return total.reshape(*total.shape[:2], heads * depth)
 
 

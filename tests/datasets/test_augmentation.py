@@ -135,16 +135,16 @@ def test_two_flips_are_none():
     np.testing.assert_allclose(after.lines.points[valid], before.lines.points[valid], atol=1e-6)
 
 
-@pytest.mark.parametrize("seed", range(12))
-def test_points_stay_on_the_painted_line(seed):
-    """Lines painted into a black image are bright under their points after the warp, in the middle of the paint."""
-    before = example(lines=3, height=360, width=640)
-    image = np.zeros((360, 640, 3), np.uint8)
+@pytest.mark.parametrize(("seed", "larger"), [(seed, 1 + seed % 2) for seed in range(12)])
+def test_points_stay_on_the_painted_line(seed, larger):
+    """Painted lines are bright under their points after the warp, in the middle of the paint; half of them larger."""
+    before = example(lines=3, height=360 * larger, width=640 * larger)
+    image = np.zeros_like(before.image)
     # OpenCV paints around pixel centres, half a pixel from the corner that shares count from; 1/16 pixel steps.
     for points in before.lines.points:
-        pixels = np.round((points * (640, 360) - 0.5) * 16).astype(np.int32)
-        cv2.polylines(image, [pixels], False, (255, 255, 255), 3, cv2.LINE_AA, 4)
-    after = augment(replace(before, image=image), WARPS, seed)
+        pixels = np.round((points * (640 * larger, 360 * larger) - 0.5) * 16).astype(np.int32)
+        cv2.polylines(image, [pixels], False, (255, 255, 255), 3 * larger, cv2.LINE_AA, 4)
+    after = augment(replace(before, image=image), WARPS, seed, (360, 640))
     points = after.lines.points[after.lines.point_valid] * (640, 360) - 0.5
     points = points[((points > 6) & (points < (633, 353))).all(1)].astype(np.float32)
     assert len(points) > 12
@@ -185,10 +185,10 @@ def test_steep_turns_swap_points_of_one_line():
 
 
 def test_of_lines_that_a_turn_bends_back_the_near_part_stays():
-    """Points on an arc: after a turn by 45 degrees, its far end has rows that its near end has, too."""
+    """Points on an arc after a hook: turned by 45 degrees, its far end has rows that its near end has, too."""
     angles = np.radians(np.linspace(90.0, 0.0, 11))  # from the far end, where the arc is level, to the near one
-    arc = np.stack([0.3 + 0.2 * np.cos(angles), 0.6 - 0.2 * np.sin(angles)], -1)
-    points, valid = np.pad(arc, ((1, 1), (0, 0)))[None].astype(np.float32), np.arange(13)[None] % 12 > 0
+    arc = np.insert(np.stack([0.3 + 0.2 * np.cos(angles), 0.6 - 0.2 * np.sin(angles)], -1), 0, (0.4, 0.39), 0)
+    points, valid = np.pad(arc, ((1, 1), (0, 0)))[None].astype(np.float32), np.arange(14)[None] % 13 > 0
     cos = math.sqrt(0.5)
     turn = np.array([[cos, cos, 0.0], [-cos, cos, 0.3 * HEIGHT], [0.0, 0.0, 1.0]])
     after = warp_lines(LaneLines(points, valid, np.array([True])), turn, HEIGHT, HEIGHT)

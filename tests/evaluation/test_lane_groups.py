@@ -217,3 +217,15 @@ def test_traffic_beside_a_line(y, yaw, expected):
     lines.points[1], lines.category[1], lines.valid[1] = straight_lanes(0.0).points[1], LineClass.DIVIDER, True
     groups = line_groups(lines, raster(), driving(10.0, y, yaw=yaw), GROUND)
     assert [name for name in LANE_GROUPS if groups[name][0]] == expected
+
+
+@pytest.mark.parametrize(("kind", "shown"), [(LineClass.DIVIDER, 1.0), (LineClass.CENTERLINE, 2.0)])
+def test_a_centerline_is_shown_by_paint_half_a_lane_away(kind, shown):
+    """Other lines only by paint within the tolerance."""
+    lines = MapLines.empty(1, 5)
+    lines.points[0], lines.category[0], lines.valid[0] = straight_lanes(0.0).points[1], kind, True
+    for beside in (0.8, 1.8, 2.8):
+        bev = raster()
+        bev[int((beside + 10.0) / CELL), :, BevChannel.LANE_PAINT] = 255
+        groups = line_groups(lines, bev, TrafficFlow.empty(1, 3), GROUND)
+        assert groups["visible-traffic"].tolist() == [beside < shown]

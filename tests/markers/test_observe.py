@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from tests.datasets.small_logs import lane_map, segment
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import PerceptionRange, invert_pose, yaw_pose
-from tflane_jax.markers.observe import observe
+from tflane_jax.markers.observe import frame_before, observe
 from tflane_jax.markers.simulation import SimulatedMarkers
 from tflane_jax.markers.store import MarkerStore, StoredMarker, UnknownMarkerWarning, store_of
 from tflane_jax.scene.logs import PlacedMarkers
@@ -259,3 +259,9 @@ def test_a_pose_that_is_not_finite_is_named(value):
         observe(detect(pose), STORE, RANGE, **SIZES)
     used = observe(detect(pose, valid=[True, False, True]), STORE, RANGE, **SIZES)
     assert sorted(rows_of(used.markers)) == [2, 5]
+
+
+@pytest.mark.parametrize(("now", "expected"), [(0.2, None), (0.7, 0), (1.0, 1), (1.25, 1), (1.26, None)])
+def test_the_frame_before_is_the_interval_ago_up_to_half_of_it(now, expected):
+    assert frame_before([0, 500_000_000], int(now * 1e9), 0.5) == expected
+    assert frame_before([], int(now * 1e9), 0.5) is None

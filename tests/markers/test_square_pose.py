@@ -59,12 +59,32 @@ def test_the_prior_decides_where_both_poses_fit():
         by_prior = solve_square(between, camera.intrinsics, camera.camera_from_ego)
         right = [degrees_between(ego_from @ fit.camera_from_marker[0], truth) < 15.0 for fit in (by_error, by_prior)]
         assert by_error.error[0] <= by_error.error[1]
+        for solution, error in zip(ego_from @ by_prior.camera_from_marker, by_prior.error, strict=True):
+            off = marker_outline(solution, 1.0, camera.intrinsics, camera.camera_from_ego) - between
+            assert error == pytest.approx(np.sqrt((off**2).sum(-1).mean()), abs=1e-4)
         if by_error.ambiguity <= 0.6:
             assert right[0] == right[1] == (fraction < 0.5)
         else:
             doubtful += not right[0]
             assert right[1]
     assert doubtful > 0
+
+
+def test_where_both_poses_fit_upright_facing_and_error_decide_together():
+    """Noisy corners: the preferred pose has the smaller sum of squares of `solve_square`."""
+    rng, ego_from, config, doubtful = np.random.default_rng(0), invert_pose(AHEAD.camera_from_ego), DetectorConfig(), 0
+    for x, bearing, z, turn in rng.uniform((10.0, -0.3, 1.0, -40.0), (40.0, 0.3, 4.0, 40.0), (300, 4)):
+        corners = marker_outline(pose(x, bearing * x, z, turn), 1.0, AHEAD.intrinsics, AHEAD.camera_from_ego)
+        fit = solve_square(corners + rng.normal(0.0, 0.3, (4, 2)), AHEAD.intrinsics, AHEAD.camera_from_ego)
+        found = ego_from @ fit.camera_from_marker
+        toward = ego_from[:3, 3] - found[:, :3, 3]
+        facing = (found[:, :3, 2] * toward).sum(-1) / np.linalg.norm(toward, axis=-1)
+        lean, turned = np.arccos(found[:, 2, 1]) / config.tilt, np.arccos(facing) / config.turn
+        cost = lean**2 + turned**2 + (fit.error / fit.error.min()) ** 2
+        if fit.ambiguity > config.ambiguous:
+            doubtful += 1
+            assert cost[0] < 1.02 * cost[1]
+    assert doubtful > 80
 
 
 def test_outline_is_upper_left_first():

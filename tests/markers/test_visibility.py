@@ -1,9 +1,12 @@
 """Boards in the image and behind bodies."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from tests.markers.test_simulation import markers_at, standing
+from tflane_jax.geometry import invert_pose, yaw_pose
 from tflane_jax.markers.visibility import hidden_from, in_image, seen_fraction
 from tflane_jax.world.cameras.ring import ARGOVERSE2_RING, NUSCENES_RING, CameraRigConfig, draw_rig
 from tflane_jax.world.roads.markers import marker_pose
@@ -27,6 +30,22 @@ def test_a_board_must_lie_in_an_image_as_a_whole(mounts, distance, expected):
     scene = standing()
     seen = seen_fraction(scene, scene.keyframes[0], markers_at(distance).pose, 1.0, mounts, None)
     assert seen.tolist() == [float(expected)]
+
+
+@pytest.mark.parametrize(("depth", "expected"), [(0.95, False), (1.05, True)])
+def test_a_board_of_half_a_metre_is_too_near_within_a_metre(depth, expected):
+    camera = draw_rig(3, CameraRigConfig(cameras=FRONT, scale=1.0))[0]
+    pose = marker_pose(np.array([[FRONT[0].x + depth, 0.0, FRONT[0].z]]), np.array([np.pi]))
+    assert in_image(pose, 0.5, camera).tolist() == [expected]
+
+
+def test_of_several_cameras_the_one_that_sees_most_counts():
+    """A mast hides the board from the first camera, and not from one 3 m beside it."""
+    scene, board = standing(), markers_at(20.0).pose
+    mast = np.array([[10.0, 0.0, 2.0, 2.0, 0.0, 0.0, 8.0]])
+    pair = (*FRONT, replace(FRONT[0], name="beside", y=3.0))
+    for mounts, expected in ((FRONT, 0.0), (pair, 1.0), (pair[::-1], 1.0)):
+        assert seen_fraction(scene, scene.keyframes[0], board, 1.0, mounts, mast).tolist() == [expected]
 
 
 def test_bodies_hide_the_part_behind_them():
@@ -57,6 +76,17 @@ def test_road_users_hide_boards_too():
     assert seen[0] < 0.2
     assert seen[1] == 1.0
     np.testing.assert_array_equal(seen_fraction(scene, scene.keyframes[0], pose, 1.0, FRONT, None), 1.0)
+
+
+def test_road_users_keep_their_heading_on_the_ground():
+    """The vehicle has turned to the left since their frame: it looks along a long lorry, and past it."""
+    scene = standing(boxes=[(10.0, 0.0, 2.0)])
+    scene.actors.size[:] = (8.0, 0.5, 4.0)
+    turned = yaw_pose(*np.array([[0.0], [0.0], [np.pi / 2]]))[0]
+    moment = replace(scene.keyframes[0], global_from_ego=turned)
+    board = invert_pose(turned) @ marker_pose(np.array([[20.0, 0.0, 3.0]]), np.array([np.pi]))
+    seen = seen_fraction(scene, moment, board, 1.0, FRONT, np.zeros((0, 7)), framed=False)
+    assert seen[0] > 0.8
 
 
 def test_no_boards():

@@ -94,6 +94,7 @@ def test_a_long_union_keeps_its_heaviest_lanes_with_their_connectivity():
     jax.tree.map(np.testing.assert_array_equal, enough, whole)
     # Of the bank's three lanes the two of the first frame weigh 0.9 / 4, that of the second 0.4 / 2.
     np.testing.assert_array_equal(cut[2].points[:, 0], [[1.0, 0.0], [1.0, 1.0]])
+    np.testing.assert_allclose(cut[2].confidence, 0.9 / 4, rtol=1e-6)
     np.testing.assert_array_equal(cut[2].successor, [[False, True], [False, False]])
     np.testing.assert_array_equal(np.argwhere(whole[2].successor), [[2 * LANES, 2 * LANES + 1]])
     assert cut[2].gate == whole[2].gate

@@ -58,9 +58,10 @@ def test_coordinates_span_the_range_and_labels_are_one_hot():
     assert not tokens.points[[1, 3]].any()
 
 
-def test_a_category_beyond_the_labels_counts_as_the_last():
-    tokens = sd_map_tokens(small_map(), dataclasses.replace(CONFIG, categories=3))
-    assert np.argwhere(tokens.labels).tolist() == [[0, 1], [2, 2]]
+@pytest.mark.parametrize("categories", [3, int(SdCategory.OTHER)])
+def test_a_category_beyond_the_labels_counts_as_the_last(categories):
+    tokens = sd_map_tokens(small_map(), dataclasses.replace(CONFIG, categories=categories))
+    assert np.argwhere(tokens.labels).tolist() == [[0, 1], [2, categories - 1]]
 
 
 @pytest.mark.parametrize("filler", [0.0, np.nan])

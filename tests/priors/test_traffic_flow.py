@@ -212,3 +212,13 @@ def test_only_the_last_frames_count(frames):
     found, expected = select_traffic_flow(flow, config), select_traffic_flow(flow.replace(**by_frame), config)
     assert found.frame_valid.any()
     jax.tree.map(np.testing.assert_array_equal, found, expected)
+
+
+def test_in_the_front_sector_the_nearest_come_first():
+    """By distance, not by how far ahead they are."""
+    flow = make_flow(instances=3, capacity=3)
+    flow.position[:] = np.array([(18.0, 10.0, 0.0), (20.0, 0.0, 0.0), (17.0, -8.0, 0.0)])[:, None]
+    flow.valid[:], flow.occluded[:] = True, False
+    tokens = select_traffic_flow(flow, CONFIG)
+    assert tokens.weight[:3].tolist() == [1.0] * 3
+    assert tokens.index[:3].tolist() == [2, 1, 0]

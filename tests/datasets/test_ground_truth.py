@@ -43,6 +43,7 @@ def test_a_lane_is_cut_at_the_border_and_keeps_its_labels():
     np.testing.assert_allclose(graph.left[0, :, 1], 3.75)
     np.testing.assert_allclose(graph.right[0, :, 1], 0.25)
     assert graph.is_connector[0]
+    assert (graph.left_type[0], graph.right_type[0]) == (LineType.DASHED, LineType.SOLID)
     assert graph.visibility[0] == 1.0
     assert result.dropped == 0
 
@@ -54,12 +55,12 @@ def test_pose_moves_the_map_into_the_ego_frame():
 
 
 def test_a_boundary_that_is_outside_keeps_the_stretch_beside_the_centerline():
-    graph = crop(lane_map(segment(0, [(0.0, 24.0), (40.0, 24.0), (40.0, 60.0)], width=4.0))).graph
-    np.testing.assert_allclose(graph.left[0, 0, :2], [0.0, 26.0], atol=1e-5)
+    graph = crop(lane_map(segment(0, [(0.0, 24.0), (40.0, 24.0), (40.0, 60.0)], width=10.0))).graph
+    np.testing.assert_allclose(graph.left[0, 0, :2], [0.0, 29.0], atol=1e-5)
     assert graph.left[0, :, 1].min() > 25.0
-    # The centerline ends at 41 of 76 m of its length, and so does the stretch of the boundary.
+    # The centerline ends at 41 of 76 m of its length, and so does the stretch of the boundary, which is shorter.
     along = np.linalg.norm(np.diff(graph.left[0, :, :2], axis=0), axis=-1).sum()
-    whole = shapely.LineString([(0, 26), (40 - np.sqrt(2), 24 + np.sqrt(2)), (38, 60)]).length
+    whole = shapely.LineString([(0, 29), (40 - np.sqrt(12.5), 24 + np.sqrt(12.5)), (35, 60)]).length
     assert along == pytest.approx(whole * 41 / 76, abs=1.0)
 
 
@@ -252,7 +253,7 @@ def test_traffic_elements_are_tied_to_the_chains_of_their_segments():
     def element(x, *governed):
         return MapElement(np.array([x, 1.0, 4.0]), 0.0, 1, 2, governed)
 
-    elements = (element(30.0, 11, 404), element(49.0, 12), element(70.0, 10))
+    elements = (element(49.0, 12), element(30.0, 11, 404), element(70.0, 10))
     vector_map = lane_map(*lanes, elements=elements)
     cropped = crop(vector_map, capacity=4)
     prepared = prepare_map(vector_map, bike_lanes=True)
@@ -261,8 +262,11 @@ def test_traffic_elements_are_tied_to_the_chains_of_their_segments():
     out.validate()
     assert out.valid.tolist() == [True, True, False]
     assert out.attribute[:2].tolist() == [1, 2]
-    assert out.lane.tolist() == [[True, False, False], [False, True, False], [False] * 3, [False] * 3]
+    assert out.lane.tolist() == [[False, True, False], [True, False, False], [False] * 3, [False] * 3]
     assert dropped == 0
+    wide = PerceptionRange((-100.0, 100.0), (-50.0, 50.0))
+    out, dropped = traffic_elements(elements, shown, prepared.chain_of, cropped, np.eye(4), wide, capacity=3)
+    assert (out.valid.sum(), dropped) == (2, 0)  # the third is farther than 60 m
     out, dropped = traffic_elements(elements, shown, prepared.chain_of, cropped, np.eye(4), RANGE, capacity=1)
     assert (out.position[0, 0], dropped) == (30.0, 1)
     # The same elements tied to the segments themselves: 11 is a row of its own.
@@ -271,4 +275,4 @@ def test_traffic_elements_are_tied_to_the_chains_of_their_segments():
         elements, shown, prepared.segment_of, segments, np.eye(4), RANGE, capacity=3, of="segments"
     )
     assert out.lane is None
-    assert out.segment.tolist() == [[False] * 3, [True, False, False], [False, True, False], [False] * 3]
+    assert out.segment.tolist() == [[False] * 3, [False, True, False], [True, False, False], [False] * 3]

@@ -218,6 +218,9 @@ def test_centerlines_are_simplified_within_their_tolerance():
     (path,) = lane_paths({0: curve}, [], PATCH)
     assert len(path) < 20
     assert np.abs(np.interp(x, path[:, 0], path[:, 1]) - curve[:, 1]).max() < 1.5 * SIMPLIFIED
+    # A turn beyond the end is far from the line between the ends, not from its extension.
+    (back,) = lane_paths({0: line((0, 0), (10, 0.1), (5, 0))}, [], PATCH)
+    assert back[:, 0].tolist() == [0, 10, 5]
 
 
 def test_lines_are_joined_where_exactly_two_ends_meet():

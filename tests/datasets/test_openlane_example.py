@@ -1,11 +1,14 @@
 """Annotations of OpenLane-V2 at the capacities of an example."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from tflane_jax.datasets.base import TruncationWarning
 from tflane_jax.datasets.openlane_annotation import Annotation
-from tflane_jax.datasets.openlane_example import area_set, lane_graph
+from tflane_jax.datasets.openlane_example import area_set, element_set, lane_graph
+from tflane_jax.scene import TrafficElements
 
 
 def annotation(lines, left=None):
@@ -51,3 +54,22 @@ def test_distances_are_to_lines_and_not_to_their_vertices():
     assert kept.tolist() == [1]
     np.testing.assert_array_equal(graph.points[0, :, 1], 0.0)
     np.testing.assert_array_equal(areas.points[0, :, 1], 0.0)
+
+
+def test_of_too_many_elements_the_largest_in_the_image_stay_with_their_lanes():
+    """In the order of the file; of the lanes, those that the example has. A box without height is none."""
+    sizes = np.array([(2.0, 3.0), (5.0, 4.0), (90.0, 0.0), (4.0, 4.0)])
+    found = replace(
+        annotation([np.zeros((2, 3))] * 3),
+        boxes=np.stack([np.full((4, 2), 10.0), 10.0 + sizes], 1),
+        element_category=np.array([1, 2, 1, 1]),
+        attribute=np.arange(4),
+        lane_element=np.arange(12).reshape(3, 4) % 5 == 0,  # lane 0: element 0; lane 1: element 1; lane 2: element 2
+    )
+    with pytest.warns(TruncationWarning, match="more elements"):
+        out = element_set(found, TrafficElements.empty(2, 2), np.array([1, 2]), None)
+    assert out.attribute.tolist() == [1, 3]
+    assert out.category.tolist() == [2, 1]
+    assert out.lane.tolist() == [[True, False], [False, False]]
+    whole = element_set(found, TrafficElements.empty(4, 2), np.array([1, 2]), None)
+    assert whole.attribute[whole.valid].tolist() == [0, 1, 3]

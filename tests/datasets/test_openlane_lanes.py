@@ -36,8 +36,15 @@ def test_pieces_of_one_lane_are_joined():
 
 @pytest.mark.parametrize(
     "other",
-    [straight(60, 90), straight(-50, 50, y=3.5), straight(50, -50), straight(0, 1, y=40.0, count=2)],
-    ids=["gap", "beside", "opposite", "far"],
+    [
+        straight(60, 90),
+        straight(-50, 50, y=3.5),
+        straight(50, -50),
+        straight(0, 1, y=40.0, count=2),
+        np.concatenate([straight(10, 19, y=6.0), straight(20, 40)]),
+        np.concatenate([straight(20, 40), straight(41, 50, y=6.0)]),
+    ],
+    ids=["gap", "beside", "opposite", "far", "merge", "fork"],
 )
 def test_pieces_that_do_not_overlap_stay_apart(other):
     frames = [seen(0.0, [("7", straight(-50, 50))]), seen(5.0, [("7", other)])]

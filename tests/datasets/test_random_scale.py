@@ -62,7 +62,7 @@ def test_invalid_cameras_and_padding_may_hold_anything():
 
 def test_depth_stays_with_its_surface():
     depth = np.zeros((6, 6, 8), np.float32)
-    depth[:, 2:4, 4:8] = 10.0
+    depth[:, 3:5, 5:8] = 10.0  # the middles of the new cells lie in rows 1, 3, 5 and columns 1, 3, 5, 7
     views = {"depth": depth, "depth_valid": depth > 0}
     after = scaled_example(with_views(**views), 0.5).cameras
     expected = np.zeros((6, 6, 8), bool)

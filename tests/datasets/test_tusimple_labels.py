@@ -2,10 +2,13 @@
 
 import json
 
+import numpy as np
 import pytest
 
+from tflane_jax.datasets.lane_rows import lane_lines
 from tflane_jax.datasets.tusimple import SOURCE, TuSimpleConfig, TuSimpleDataset
 from tflane_jax.errors import UserError
+from tflane_jax.files.tusimple import NO_POINT, ROWS, RowLanes
 
 
 def test_scores_are_of_the_labels_that_were_there(tmp_path):
@@ -30,3 +33,12 @@ def test_images_outside_of_the_folder_are_not_read(tmp_path, name):
     (tmp_path / "label_data_0313.json").write_text(json.dumps(record))
     with pytest.raises(UserError, match=r"0313\.json: raw_file: .*secret\.jpg' is not within the folder"):
         TuSimpleDataset(TuSimpleConfig(str(tmp_path)))
+
+
+def test_lines_are_sorted_by_their_first_points_and_reach_the_border():
+    """One from 600 pixels down to the left border, where x is 0, and one from 500 pixels to the right."""
+    left, right = np.linspace(660.0, 0.0, len(ROWS)), np.linspace(500.0, 900.0, len(ROWS))
+    left[:5] = NO_POINT
+    lines = lane_lines(RowLanes(np.stack([left, right]), ROWS), 720, 1280, capacity=2)
+    np.testing.assert_allclose(lines.points[:, -1, 0] * 1280, [900.0, 0.0], atol=1e-3)
+    assert lines.point_valid[:, -1].all()

@@ -12,6 +12,7 @@ from tests.metrics.cases import hand_frame
 from tests.metrics.fixtures import expected_cases, load_frames
 from tests.scoring.files import FRAMES, centerline_annotation, write_collection, write_submission
 from tflane_jax.cli import main
+from tflane_jax.scoring.openlane_v2 import read_truth
 
 PROTOCOL = "openlane-v2.1-centerline"
 DETECTIONS, TRUTH = hand_frame()
@@ -115,6 +116,8 @@ def test_dense_annotations_are_thinned(files):
     before = run(files)[1]["rows"]
     write_collection(files / "annotations.pkl", dict.fromkeys(FRAMES, dense))
     assert run(files)[1]["rows"] == before
+    (found, *_) = read_truth(files / "annotations.pkl", progress=False).values()
+    np.testing.assert_allclose(found.points, [line[::20] for line in dense.points])
 
 
 def test_the_table_names_protocol_and_scenes(files, capsys):

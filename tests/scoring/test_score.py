@@ -28,6 +28,14 @@ def test_a_number_that_a_sample_lacks_has_no_interval():
     assert found["error"] == (1.0, 3.0)
 
 
+def test_an_interval_holds_95_percent_of_the_draws():
+    """The mean over 50 scenes is nearly normal: 1.96 standard errors to either side."""
+    values = np.random.default_rng(0).uniform(size=50)
+    scenes = {str(number): Errors([value]) for number, value in enumerate(values.tolist())}
+    low, high = Scored(scenes).intervals(2000, progress=False)["error"]
+    assert high - low == pytest.approx(2.0 * 1.96 * values.std() / np.sqrt(50), rel=0.08)
+
+
 def test_a_class_that_a_draw_lacks_is_no_error():
     """Regression: two of ten drives have crossings, all lines are found, and the interval of mAP began at 2/3."""
     line = np.array([[0.0, 0.0], [9.0, 0.0]])

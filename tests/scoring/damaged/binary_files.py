@@ -81,6 +81,7 @@ def _openlane(form, lanes, line, lane_lane, lane_element):
                 r"points is \[\[10.0, 10.0\], \[0.0, 0.0\]\]: expected the top-left",
             ),
             ("width and height", [[100, 100], [20, 30]], "width and height in place of the second"),
+            ("height", [[100, 100], [120, 30]], "width and height in place of the second"),
             ("flat", [0, 0, 10, 10], r"has shape \(4,\), expected \(2, 2\)"),
             ("NaN", [[0, 0], [10, np.nan]], r"holds nan at \[1, 1\]"),
             ("too wide", [[0, 0], [1e200, 10]], r"holds 1e\+200 at \[1, 0\]: beyond 100000 in size"),

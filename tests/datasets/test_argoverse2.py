@@ -33,6 +33,7 @@ def test_reads_tracks_poses_and_map(folder):
     assert (log.name, log.source, log.tracks.frames) == ("log-a", "argoverse2", FRAMES)
     assert log.tracks.uuid.tolist() == ["car", "walker"]
     assert log.tracks.category.tolist() == [RoadUser.CAR, RoadUser.PEDESTRIAN]
+    assert log.tracks.size.tolist() == [[4.0, 2.0, 1.5]] * 2  # length, width, height
     assert log.tracks.valid.T.tolist() == [[True] * FRAMES, [False, True, *[False] * 4]]
     assert log.tracks.position[:, 0, 0].tolist() == [10, 11, 12, 13, 14, 15]
     assert log.tracks.occluded.T.tolist() == [[True, *[False] * 5], [False] * 6]

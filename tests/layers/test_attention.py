@@ -330,13 +330,3 @@ def test_masks_of_numbers_are_refused(dtype):
             attend(x, x, x, mask)
     with pytest.raises(TypeError, match=f"mask is {dtype}"):
         MultiHeadAttention(8, 2).init(jax.random.key(0), x[0], x[0], x[0], mask)
-
-
-def test_weights_can_be_dropped():
-    query, key, value, _ = arrays(20, 4, 4)
-    mask = jnp.asarray(np.random.default_rng(0).random((4, 4)) < 0.6).at[1].set(False)
-    plain = masked_attention(query, key, value, mask)
-    np.testing.assert_allclose(masked_attention(query, key, value, mask, lambda w: w), plain, rtol=1e-5, atol=1e-6)
-    first = masked_attention(query, key, value, mask, lambda weights: weights.at[..., 1:].set(0.0))
-    weights = attention_probabilities(query, key, mask)
-    np.testing.assert_allclose(first, weights[..., :1] * value[:, :1], rtol=1e-5, atol=1e-6)

@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float
 
 Mask = Bool[Array, "#q #k"] | Bool[Array, "#h #q #k"]
 Drop = Callable[[Array], Array] | None
-"""Dropout of attention weights, None for none."""
+"""Dropout of attention weights, such as `WeightDropout`; None for none."""
 
 # Logits per head that are held at once. Larger problems go through blocks of queries, whose logits are computed again
 # for the gradient: at 4,000 x 4,000 on two cores 2.5 times as fast as the libraries, and without their half gigabyte.
@@ -44,7 +44,8 @@ def masked_attention(
     Args:
         query, key, value: heads first.
         mask: true where a query may attend to a key; None allows all. Rank 2 holds for all heads.
-        drop: dropout of the weights (h, q, k), all of which are held then; masked slots must be finite.
+        drop: dropout of the weights. All of them (h, q, k) are held then, and masked slots must be finite, unless it is
+            a `WeightDropout` and the problem so large that it goes through blocks.
 
     Raises:
         TypeError: the mask is not bool.
@@ -53,17 +54,27 @@ def masked_attention(
     if queries == 0 or keys == 0:
         return jnp.zeros((heads, queries, value.shape[-1]), value.dtype)
     mask = _per_head(mask)
-    if drop is not None:
+    whole = queries * keys <= BLOCK
+    if drop is not None and (whole or not isinstance(drop, WeightDropout)):
         return jnp.einsum("hqk,hke->hqe", drop(attention_probabilities(query, key, mask).astype(value.dtype)), value)
-    if queries * keys <= BLOCK:
+    if whole:
         return _attend(query, key, value, mask)
     # The last block is filled up with zero queries, whose results are cut off and whose gradients are zero.
     rows = math.ceil(queries / math.ceil(queries * keys / BLOCK))
     filled = jnp.pad(query, ((0, 0), (0, -queries % rows), (0, 0)))
     if mask is not None and mask.shape[1] > 1:
         mask = jnp.pad(mask, ((0, 0), (0, -queries % rows), (0, 0)))
-    out: Array = _attend_in_blocks(rows, filled, key, value, mask)
+    rate, stream = (0.0, None) if drop is None else (drop.rate, drop.stream())
+    out: Array = _attend_in_blocks(rows, rate, filled, key, value, mask, stream)
     return out[:, :queries]
+
+
+class WeightDropout(nn.Dropout):
+    """Dropout of attention weights that blocks of queries can draw one after the other, once more for the gradient."""
+
+    def stream(self) -> Array:
+        """Return the key of all random numbers of a call."""
+        return self.make_rng(self.rng_collection)
 
 
 def attention_probabilities(
@@ -154,7 +165,7 @@ def _attend_backward(residuals, gradient):
 _attend.defvjp(_attend_forward, _attend_backward)
 
 
-def _gradients(query, key, value, weights, out, gradient):
+def _gradients(query, key, value, weights, out, gradient, kept=None):
     """Return the gradients of query, key and value.
 
     Args:
@@ -162,56 +173,65 @@ def _gradients(query, key, value, weights, out, gradient):
         weights: exp(logits) up to a factor per row.
         out: the result of attention, float32 or finer.
         gradient: of the result, divided by the sum of the row's weights.
+        kept: factors of dropout, which `weights` are without; None for 1.
     """
-    to_value = jnp.einsum("hqk,hqe->hke", weights, gradient)
+    to_value = jnp.einsum("hqk,hqe->hke", weights if kept is None else weights * kept, gradient)
     dtype = _softmax_dtype(value)
     to_weight = jnp.einsum("hqe,hke->hqk", gradient, value, preferred_element_type=dtype)
     # Softmax: dz = p (dp - sum_k p dp), and sum_k p dp = out . d out.
     along = (gradient.astype(dtype) * out).sum(-1, keepdims=True)
-    to_logit = weights.astype(dtype) * (lax.optimization_barrier(to_weight) - along) / math.sqrt(query.shape[-1])
+    to_weight = lax.optimization_barrier(to_weight)
+    to_weight = to_weight if kept is None else to_weight * kept.astype(dtype)
+    to_logit = weights.astype(dtype) * (to_weight - along) / math.sqrt(query.shape[-1])
     to_logit = lax.optimization_barrier(to_logit.astype(query.dtype))
     to_query = jnp.einsum("hqk,hkd->hqd", to_logit, key)
     to_key = jnp.einsum("hqk,hqd->hkd", to_logit, query)
     return to_query.astype(query.dtype), to_key.astype(key.dtype), to_value.astype(value.dtype)
 
 
-@partial(jax.custom_vjp, nondiff_argnums=(0,))
-def _attend_in_blocks(rows: int, query, key, value, mask) -> Array:
-    """Attend `rows` queries at a time, a divisor of their number, keeping one number per query for the gradient."""
-    return _in_blocks_forward(rows, query, key, value, mask)[0]
+@partial(jax.custom_vjp, nondiff_argnums=(0, 1))
+def _attend_in_blocks(rows: int, rate: float, query, key, value, mask, stream) -> Array:
+    """Attend `rows` queries at a time, a divisor of their number, keeping one number per query for the gradient.
+
+    Weights are dropped with probability `rate`, by random numbers of `stream`; None for no dropout.
+    """
+    return _in_blocks_forward(rows, rate, query, key, value, mask, stream)[0]
 
 
-def _in_blocks_forward(rows, query, key, value, mask):
+def _in_blocks_forward(rows, rate, query, key, value, mask, stream):
     value = _clear_keys(value, mask)
 
     def block(inputs):
-        query, mask = inputs
+        query, mask, stream = inputs
         logits = _logits(query, key, mask)
         log_total = _log_total(logits)
         weights = jnp.exp(logits - log_total).astype(value.dtype)
+        weights = weights if stream is None else weights * _kept(weights, rate, stream)
         return jnp.einsum("hqk,hke->hqe", weights, value, preferred_element_type=log_total.dtype), log_total
 
-    out, log_total = lax.map(block, (_split(query, rows), _split_mask(mask, query.shape[1], rows)))
-    return _join(out).astype(value.dtype), (query, key, value, mask, out, log_total)
+    masks, streams = _split_mask(mask, query.shape[1], rows), _split_stream(stream, query.shape[1] // rows)
+    out, log_total = lax.map(block, (_split(query, rows), masks, streams))
+    return _join(out).astype(value.dtype), (query, key, value, mask, stream, out, log_total)
 
 
-def _in_blocks_backward(rows, residuals, gradient):
-    query, key, value, mask, out, log_total = residuals
+def _in_blocks_backward(rows, rate, residuals, gradient):
+    query, key, value, mask, stream, out, log_total = residuals
     query, key = _clear_queries(query, mask), _clear_keys(key, mask)
 
     def block(sums, inputs):
-        query, mask, out, log_total, gradient = inputs
+        query, mask, stream, out, log_total, gradient = inputs
         weights = jnp.exp(_logits(query, key, mask) - log_total)
         weights = lax.optimization_barrier(weights.astype(value.dtype))
-        to_query, *to_others = _gradients(query, key, value, weights, out, gradient)
+        kept = None if stream is None else _kept(weights, rate, stream)
+        to_query, *to_others = _gradients(query, key, value, weights, out, gradient, kept)
         return [total + part.astype(total.dtype) for total, part in zip(sums, to_others, strict=True)], to_query
 
-    masks = _split_mask(mask, query.shape[1], rows)
-    inputs = (_split(query, rows), masks, out, log_total, _split(gradient, rows))
+    masks, streams = _split_mask(mask, query.shape[1], rows), _split_stream(stream, query.shape[1] // rows)
+    inputs = (_split(query, rows), masks, streams, out, log_total, _split(gradient, rows))
     # Many blocks add up: their sums are float32 also for bfloat16.
     start = [jnp.zeros(each.shape, _softmax_dtype(each)) for each in (key, value)]
     (to_key, to_value), to_query = lax.scan(block, start, inputs)
-    return _join(to_query), to_key.astype(key.dtype), to_value.astype(value.dtype), None
+    return _join(to_query), to_key.astype(key.dtype), to_value.astype(value.dtype), None, None
 
 
 _attend_in_blocks.defvjp(_in_blocks_forward, _in_blocks_backward)
@@ -230,6 +250,15 @@ def _split_mask(mask, queries, rows):
     if mask is None or mask.shape[1] == queries:
         return None if mask is None else _split(mask, rows)
     return jnp.broadcast_to(mask, (queries // rows, *mask.shape))
+
+
+def _split_stream(stream, blocks):
+    return None if stream is None else jax.random.split(stream, blocks)
+
+
+def _kept(weights, rate, stream):
+    """Return the factors of dropout: 0, or what keeps the expectation."""
+    return jax.random.bernoulli(stream, 1.0 - rate, weights.shape).astype(weights.dtype) / (1.0 - rate)
 
 
 class MultiHeadAttention(nn.Module):
@@ -279,7 +308,7 @@ class MultiHeadAttention(nn.Module):
         if self.is_mutable_collection("intermediates"):
             self.sow("intermediates", "probabilities", attention_probabilities(q, k, mask))
         drops = self.dropout > 0 and not deterministic
-        drop = nn.Dropout(self.dropout, deterministic=False, name="dropout") if drops else None
+        drop = WeightDropout(self.dropout, deterministic=False, name="dropout") if drops else None
         heads = masked_attention(q, k, v, mask, drop)
         attended = heads.swapaxes(0, 1).reshape(query.shape[0], self.dim)
         init = nn.initializers.zeros if self.zero_init else nn.linear.default_kernel_init

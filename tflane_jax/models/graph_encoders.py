@@ -27,7 +27,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from tflane_jax.errors import UserError
-from tflane_jax.layers.attention import Drop, attention_probabilities, masked_attention
+from tflane_jax.layers.attention import Drop, WeightDropout, attention_probabilities, masked_attention
 from tflane_jax.layers.graph_transformer import propagate
 from tflane_jax.layers.image_graph import (
     AXES,
@@ -224,7 +224,7 @@ class GraphEncoderLayer(nn.Module):
             return nn.Dropout(config.dropout, name=name)(x, deterministic=deterministic)
 
         drops = config.dropout > 0 and not deterministic
-        drop_weights = nn.Dropout(config.dropout, deterministic=False, name="weights_dropout") if drops else None
+        drop_weights = WeightDropout(config.dropout, deterministic=False, name="weights_dropout") if drops else None
         mixed = config.mixing("graph")(x, position, valid, drop_weights)
         x = nn.LayerNorm(epsilon=1e-5, name="graph_norm")(x + drop("graph_dropout", mixed))
         hidden = drop("hidden_dropout", nn.relu(nn.Dense(config.hidden, name="expand")(x)))

@@ -7,6 +7,7 @@ import pytest
 
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.losses.auxiliary import auxiliary_losses, denoising_pairs
+from tflane_jax.losses.lane_weights import LaneWeights
 from tflane_jax.models.auxiliary import AuxiliaryOutputs, LaneProposalOutputs
 from tflane_jax.scene import CenterlinePrediction, LaneGraph
 
@@ -39,11 +40,24 @@ def test_proposal_losses_of_equal_examples_do_not_depend_on_their_number():
             AuxiliaryOutputs(lane_proposals=proposals),
             ("lane_proposals",),
             truth,
+            weights=LaneWeights(proposal_weight=1.5, points_weight=0.5),
             bev_range=PerceptionRange(),
-            cell_weight=1.0,
-            proposal_weights=(1.5, 0.5),
             denoising=lambda *_: {},
         )[1]
         return {name: float(value) for name, value in terms.items()}
 
     assert report(2) == pytest.approx(report(1), rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("outputs", "name", "message"),
+    [
+        (AuxiliaryOutputs(), "lane_cells", "lane_cells, but it is missing: sow it in the model"),
+        (AuxiliaryOutputs(line_mask=jnp.zeros((1, 2, 3))), "line_mask", "line_mask has no loss: add a branch"),
+    ],
+)
+def test_an_output_that_is_missing_and_one_without_a_loss_are_two_faults(outputs, name, message):
+    truth = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], LaneGraph.empty(2, 5))
+    settings = {"weights": LaneWeights(), "bev_range": PerceptionRange(), "denoising": lambda *_: {}}
+    with pytest.raises(ValueError, match=message):
+        auxiliary_losses(outputs, (name,), truth, **settings)

@@ -13,6 +13,7 @@ from tflane_jax.geometry import PerceptionRange
 from tflane_jax.losses import lane_cells as losses
 from tflane_jax.losses.auxiliary import auxiliary_losses
 from tflane_jax.losses.lane_cells import lane_cell_loss, used_lanes
+from tflane_jax.losses.lane_weights import LaneWeights
 from tflane_jax.models.auxiliary import CELL_CHANNELS, AuxiliaryOutputs
 from tflane_jax.scene import LaneGraph
 
@@ -140,6 +141,6 @@ def test_a_batch_of_few_lanes_takes_few_rounds(monkeypatch):
     one, none = graph([[0.0, 0.5, 0], [4.0, 2.0, 0], [8.0, 3.5, 0]], capacity=50), LaneGraph.empty(50, 3)
     batch = jax.tree.map(lambda *leaves: jnp.stack(list(map(jnp.asarray, leaves))), none, one)
     outputs = AuxiliaryOutputs(lane_cells=jnp.zeros((2, *SHAPE, CELL_CHANNELS)))
-    weights = {"cell_weight": 1.0, "proposal_weights": (1.0, 1.0), "denoising": None}
-    auxiliary_losses(outputs, ("lane_cells",), batch, bev_range=RANGE, **weights)
+    settings = {"weights": LaneWeights(), "bev_range": RANGE, "denoising": None}
+    auxiliary_losses(outputs, ("lane_cells",), batch, **settings)
     assert rounds == [2]

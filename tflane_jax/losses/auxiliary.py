@@ -1,4 +1,4 @@
-"""Auxiliary losses of several hosts: denoised lanes, and lanes per BEV cell. None of the lane papers has them."""
+"""Auxiliary losses of the lane hosts: denoised lanes, BEV cells, lane proposals. None of the lane papers has them."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from tflane_jax.geometry import PerceptionRange
 from tflane_jax.losses.common import Report, Terms, last_layer
 from tflane_jax.losses.lane_cells import lane_cell_loss, used_lanes
 from tflane_jax.losses.lane_proposals import lane_proposal_sums
+from tflane_jax.losses.lane_weights import LaneWeights
 from tflane_jax.matching import Assignment
 from tflane_jax.models.auxiliary import AuxiliaryName, AuxiliaryOutputs
 from tflane_jax.scene import CenterlinePrediction, LaneGraph, LinePrediction, SegmentPrediction
@@ -26,9 +27,8 @@ def auxiliary_losses(
     names: Sequence[AuxiliaryName],
     lanes: LaneGraph,
     *,
+    weights: LaneWeights,
     bev_range: PerceptionRange,
-    cell_weight: float,
-    proposal_weights: tuple[float, float],
     denoising: Callable[[Any, LaneGraph], Terms],
     cell_lanes: LaneGraph | None = None,
 ) -> tuple[list[Float[Array, ""]], Report]:
@@ -38,9 +38,9 @@ def auxiliary_losses(
         outputs: auxiliary outputs, leading axis batch.
         names: the auxiliary outputs that the host declares.
         lanes: ground truth, leading axis batch; padding may hold anything.
+        weights: `cell_weight` of BEV cells; `proposal_weight` and `points_weight` of the heat map and of the shapes of
+            proposed lanes. `denoising` has its own.
         bev_range: the box that the BEV features cover, metres.
-        cell_weight: weight of the loss on BEV cells.
-        proposal_weights: weights of the heat map and of the shapes of proposed lanes.
         denoising: from predictions of denoised lanes and the ground truth to weighted losses per layer.
         cell_lanes: ground truth of the BEV cells, where it is not `lanes`.
 
@@ -49,27 +49,27 @@ def auxiliary_losses(
     """
     losses, report = [], {}
     for name in names:
-        if name == "denoised" and outputs.denoised is not None:
-            terms = denoising(outputs.denoised, lanes)
+        if (output := getattr(outputs, name)) is None:
+            raise ValueError(f"the host declares the auxiliary output {name}, but it is missing: sow it in the model")
+        if name == "denoised":
+            terms = denoising(output, lanes)
             losses.append(sum(term.sum() for term in terms.values()))
             report |= {f"denoised_{key}": value for key, value in last_layer(terms).items()}
-        elif name == "lane_cells" and outputs.lane_cells is not None:
+        elif name == "lane_cells":
             each = jax.vmap(lane_cell_loss, in_axes=(0, 0, None, None))
             inside = lanes if cell_lanes is None else cell_lanes
             used = used_lanes(inside.valid)
-            report["cells"] = cell_weight * each(outputs.lane_cells, inside, bev_range, used).mean()
+            report["cells"] = weights.cell_weight * each(output, inside, bev_range, used).mean()
             losses.append(report["cells"])
-        elif name == "lane_proposals" and outputs.lane_proposals is not None:
+        elif name == "lane_proposals":
             each = jax.vmap(partial(lane_proposal_sums, range_=bev_range))
             count = jnp.maximum(lanes.valid.sum(), 1).astype(jnp.float32)
-            heat, shapes = (
-                weight * value.sum() / count
-                for weight, value in zip(proposal_weights, each(outputs.lane_proposals, lanes), strict=True)
-            )
+            sums, by = each(output, lanes), (weights.proposal_weight, weights.points_weight)
+            heat, shapes = (weight * value.sum() / count for weight, value in zip(by, sums, strict=True))
             report |= {"proposal_heat": heat, "proposal_points": shapes}
             losses += [heat, shapes]
         else:
-            raise ValueError(f"the host declares the auxiliary output {name}, but it is missing or has no loss")
+            raise ValueError(f"the auxiliary output {name} has no loss: add a branch to auxiliary_losses")
     return losses, report
 
 

@@ -63,8 +63,8 @@ class LaneShapeLossConfig:
             raise ValueError("a lane-shape loss needs predicted curves")
         targets = lane_shape_targets(batch.lines, shared_horizon=self.shared_horizon)
         loss, terms = lane_shape_loss(outputs.curves, targets, self)
-        for name in host.auxiliary:
-            cells = getattr(auxiliary, name)
+        if "line_cells" in host.auxiliary:
+            cells = jnp.asarray(auxiliary.line_cells)
             terms["cells"] = self.cell_weight * jax.vmap(cell_loss)(cells, targets).mean()
             loss += terms["cells"]
         return loss, terms

@@ -105,9 +105,8 @@ class LaneSegNetLossConfig(LaneWeights, HostLossConfig):
             auxiliary,
             host.auxiliary,
             target_lanes(targets),
+            weights=self,
             bev_range=bev_range,
-            cell_weight=self.cell_weight,
-            proposal_weights=(self.proposal_weight, self.points_weight),
             denoising=denoising,
             cell_lanes=batch.segments,
         )

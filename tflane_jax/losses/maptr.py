@@ -80,7 +80,9 @@ class MapTrLossConfig(HostLossConfig):
         loss, report = line_loss(outputs.lines, targets, range_, self)
         for name in host.auxiliary:
             if (output := getattr(auxiliary, name)) is None:
-                raise ValueError(f"the host declares the auxiliary output {name}, but it is missing")
+                raise ValueError(
+                    f"the host declares the auxiliary output {name}, but it is missing: sow it in the model"
+                )
             terms = self.auxiliary_terms(name, output, targets, batch, host)
             loss, report = loss + total(terms), report | last_layer(terms)
         return loss, report
@@ -98,7 +100,7 @@ class MapTrLossConfig(HostLossConfig):
             ValueError: the output has no loss here.
         """
         if name != "denoised":
-            raise ValueError(f"the auxiliary output {name} has no loss here")
+            raise ValueError(f"the auxiliary output {name} has no loss: add a branch to auxiliary_terms")
         terms = line_denoising_losses(output, targets, host.bev_range, self)
         return {f"denoised_{key}": value for key, value in terms.items()}
 

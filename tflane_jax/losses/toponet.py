@@ -85,9 +85,8 @@ def lane_graph_host_loss(
         auxiliary,
         host.auxiliary,
         batch.lanes,
+        weights=config,
         bev_range=host.encoder.bev_range,
-        cell_weight=config.cell_weight,
-        proposal_weights=(config.proposal_weight, config.points_weight),
         denoising=partial(lane_denoising_losses, config=config, control_points=control_points),
     )
     for term in further:

@@ -32,9 +32,9 @@ def test_a_warm_started_gtn_is_the_transformer():
     outputs = []
     for encoder in (TINY.encoder, GTN):
         params = convert_lstr(state, encoder).variables["params"]["encoder"]
-        module = encoder.build(DIM, "encoder")
+        module = encoder.build("encoder")
         outputs.append(np.asarray(module.apply({"params": params}, features, position, valid))[np.asarray(valid)])
     np.testing.assert_allclose(outputs[0], outputs[1], rtol=1e-5, atol=1e-5)
     soft = convert_lstr(state, GTN, 0.5).variables["params"]["encoder"]
-    changed = GTN.build(DIM, "encoder").apply({"params": soft}, features, position, valid)
+    changed = GTN.build("encoder").apply({"params": soft}, features, position, valid)
     assert np.abs(np.asarray(changed)[np.asarray(valid)] - outputs[0]).max() > 0.01

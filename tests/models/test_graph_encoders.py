@@ -14,10 +14,10 @@ from tests.layers.test_image_graph import dense_stack
 from tests.parameters import random_params
 from tests.shared import random_array
 from tests.slow import with_slow
-from tflane_jax.errors import UserError
 from tflane_jax.layers.image_graph import SIDES
 from tflane_jax.layers.masks import key_mask
 from tflane_jax.layers.transformer import EncoderLayer, TransformerConfig
+from tflane_jax.limits import SettingError
 from tflane_jax.models.graph_encoders import (
     GcnEncoderConfig,
     GraphEncoderLayer,
@@ -26,6 +26,7 @@ from tflane_jax.models.graph_encoders import (
     HeterogeneousAttention,
     MetaPathConvolution,
 )
+from tflane_jax.models.lstr import LstrConfig
 
 DIM, SHAPE, BLOCK = 8, (5, 6), (3, 4)
 GTN = GtnEncoderConfig(head_dim=4, hidden=16)
@@ -54,7 +55,7 @@ def scene(seed=0, shape=SHAPE):
 @cache
 def built(config):
     """The module, and variables in which no weight is at a special value."""
-    module, zeros = config.build(DIM, "encoder"), jnp.zeros((1, 1, DIM))
+    module, zeros = config.build("encoder"), jnp.zeros((1, 1, DIM))
     variables = jax.eval_shape(module.init, jax.random.key(0), zeros, zeros, jnp.ones((1, 1), bool))
     rng = np.random.default_rng(7)
     weight = lambda leaf: jnp.asarray(0.4 * rng.normal(size=leaf.shape).astype(np.float32))  # noqa: E731
@@ -326,7 +327,7 @@ def test_dropout_reaches_attention_weights(name, attends):
 def test_number_of_parameters_at_lstrs_size(name):
     """Beside LSTR's transformer encoder: 25,408."""
     config = {"gtn": GtnEncoderConfig(), "gcn": GcnEncoderConfig(), "han": HanEncoderConfig()}[name]
-    module, x = config.build(32, "encoder"), jnp.zeros((12, 20, 32))
+    module, x = config.build("encoder"), jnp.zeros((12, 20, 32))
     variables = jax.eval_shape(module.init, jax.random.key(0), x, x, jnp.ones((12, 20), bool))
     assert sum(leaf.size for leaf in jax.tree.leaves(variables)) == PARAMETERS[name]
 
@@ -334,14 +335,17 @@ def test_number_of_parameters_at_lstrs_size(name):
 @pytest.mark.parametrize(
     ("config", "message"),
     [
-        (GtnEncoderConfig(channels=3), "8 features do not split over 3 channels"),
-        (GtnEncoderConfig(heads=5), "8 features do not split over 5 heads"),
-        (HanEncoderConfig(heads=3), "8 features do not split over 3 heads"),
-        (GtnEncoderConfig(relations=(), similarity=None), "needs edge types"),
-        (GtnEncoderConfig(relations=()), "needs edge types"),
-        (HanEncoderConfig(relations=()), "needs edge types"),
+        (GtnEncoderConfig(channels=3), r"^encoder\.channels is 3: it must be a divisor of dim \(8\)"),
+        (GtnEncoderConfig(heads=5), r"^encoder\.heads is 5: it must be a divisor of dim \(8\)"),
+        (HanEncoderConfig(heads=3), r"^encoder\.heads is 3: it must be a divisor of dim \(8\)"),
+        (GtnEncoderConfig(relations=(), similarity=None), r"^encoder\.relations is \(\): it must be at least one, or"),
+        (
+            GtnEncoderConfig(relations=()),
+            r"^encoder\.relations is \(\): it must be at least one, or similarity every_hop",
+        ),
+        (HanEncoderConfig(relations=()), r"^encoder\.relations is \(\): it must be .*at least one of them"),
     ],
 )
 def test_impossible_configs_are_named(config, message):
-    with pytest.raises(UserError, match=message):
-        config.build(DIM, "encoder")
+    with pytest.raises(SettingError, match=message):
+        LstrConfig(dim=DIM, encoder=config).build()

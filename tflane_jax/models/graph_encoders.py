@@ -26,7 +26,6 @@ import flax.linen as nn
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from tflane_jax.errors import UserError
 from tflane_jax.layers.attention import Drop, WeightDropout, attention_probabilities, masked_attention
 from tflane_jax.layers.graph_transformer import propagate
 from tflane_jax.layers.image_graph import (
@@ -74,12 +73,8 @@ class GtnEncoderConfig:
         """Every hop has edge types."""
         yield "relations", bool(self.relations) or self.offers_similarity(0), "at least one, or similarity every_hop"
 
-    def build(self, dim: int, name: str, computation: Computation = PLAIN) -> GraphEncoder:
-        """Return the Linen module for `dim` channels; raises UserError where they do not split."""
-        if not self.relations and not self.offers_similarity(0):
-            raise UserError("a GTN encoder needs edge types: name relations, or set similarity to 'every_hop'")
-        _check_split(dim, "channels", self.channels)
-        _check_split(dim, "heads", self.heads)
+    def build(self, name: str, computation: Computation = PLAIN) -> GraphEncoder:
+        """Return the Linen module; it infers the number of features from its input."""
         return GraphEncoder(self, computation, name=name)
 
     def offers_similarity(self, hop: int) -> bool:
@@ -105,9 +100,8 @@ class GcnEncoderConfig:
     hidden: Count = 128
     dropout: FractionBelowOne = 0.1
 
-    def build(self, dim: int, name: str, computation: Computation = PLAIN) -> GraphEncoder:
-        """Return the Linen module; it infers the number of channels from its input."""
-        del dim
+    def build(self, name: str, computation: Computation = PLAIN) -> GraphEncoder:
+        """Return the Linen module; it infers the number of features from its input."""
         return GraphEncoder(self, computation, name=name)
 
     def mixing(self, name: str) -> NeighbourConvolution:
@@ -150,11 +144,8 @@ class HanEncoderConfig:
     hidden: Count = 128
     dropout: FractionBelowOne = 0.1
 
-    def build(self, dim: int, name: str, computation: Computation = PLAIN) -> GraphEncoder:
-        """Return the Linen module for `dim` channels; raises UserError where they do not split."""
-        if not self.relations:
-            raise UserError("a HAN encoder needs edge types: name relations")
-        _check_split(dim, "heads", self.heads)
+    def build(self, name: str, computation: Computation = PLAIN) -> GraphEncoder:
+        """Return the Linen module; it infers the number of features from its input."""
         return GraphEncoder(self, computation, name=name)
 
     def mixing(self, name: str) -> HeterogeneousAttention:
@@ -342,8 +333,3 @@ def _choices(offered: list[bool], structural: int) -> Bool[Array, "hops 1 e"]:
 
 def _by_head(x: Float[Array, "h w c"], heads: int) -> Float[Array, "heads n d"]:
     return x.reshape(x.shape[0] * x.shape[1], heads, x.shape[-1] // heads).swapaxes(0, 1)
-
-
-def _check_split(dim: int, what: str, count: int) -> None:
-    if dim % count:
-        raise UserError(f"{dim} features do not split over {count} {what}: choose a divisor of {dim}")

@@ -21,7 +21,7 @@ from tflane_jax.layers.positions import image_sine_encoding
 from tflane_jax.layers.precision import PLAIN, Computation, Precision, computing, full, run_layer
 from tflane_jax.layers.resnet import ResNet, ResNetConfig
 from tflane_jax.layers.transformer import DecoderLayer, EncoderLayer, TransformerConfig
-from tflane_jax.limits import INCREASING, Count, Fraction, Rules, splits
+from tflane_jax.limits import INCREASING, Count, Fraction, Rules, check_settings, splits
 from tflane_jax.models.auxiliary import AUXILIARY, AuxiliaryName
 from tflane_jax.models.graph_encoders import GcnEncoderConfig, GtnEncoderConfig, HanEncoderConfig
 from tflane_jax.scene import CurvePrediction
@@ -43,9 +43,8 @@ class TransformerEncoderConfig:
     layers: Count = 2
     layer: TransformerConfig = TransformerConfig()
 
-    def build(self, dim: int, name: str, computation: Computation = PLAIN) -> TransformerEncoder:
-        """Return the Linen module; it infers the number of channels from its input."""
-        del dim
+    def build(self, name: str, computation: Computation = PLAIN) -> TransformerEncoder:
+        """Return the Linen module; it infers the number of features from its input."""
         return TransformerEncoder(self, computation, name=name)
 
 
@@ -115,7 +114,8 @@ class LstrConfig:
         return ("line_cells",) if self.cells else ()
 
     def build(self) -> Lstr:
-        """Return the Linen module."""
+        """Return the Linen module; raises UserError where its parts do not fit together."""
+        check_settings(self)
         return Lstr(self)
 
 
@@ -171,7 +171,7 @@ class Lstr(nn.Module):
         position = image_sine_encoding(cells, config.dim // 2)
         if config.located:
             features = features + position
-        encoder = config.encoder.build(config.dim, "encoder", config)
+        encoder = config.encoder.build("encoder", config)
         memory = encoder(features, position, cells, deterministic=not train)
         if config.cells and self.is_mutable_collection(AUXILIARY):
             self.sow(AUXILIARY, "line_cells", nn.Dense(1, name="cell_head")(memory)[..., 0])

@@ -79,14 +79,14 @@ def decode_groups(host: Any, start: Any, noised: Any, *arguments: Any) -> Predic
     """Return the predictions of the queries `start`, and sow those of `noised`, with a leading axis over copies.
 
     Args:
-        host: module with `decode_queries(start, bev, elements, tokens, deterministic)`.
-        start, noised: first argument of `decode_queries`.
-        arguments: the others; the same for all groups.
+        host: module with `decode_queries(start, *arguments)`.
+        start, noised: one set of queries, and others with a leading axis over copies.
+        arguments: the same for all sets.
     """
     starts = jax.tree.map(lambda one, others: jnp.concatenate([one[None], others]), start, noised)
     decode = nn.vmap(
         type(host).decode_queries,
-        in_axes=(0, None, None, None, None),  # pyright: ignore[reportArgumentType]
+        in_axes=(0, *(None,) * len(arguments)),  # pyright: ignore[reportArgumentType]
         variable_axes={"params": None, "intermediates": 0},
         split_rngs={"params": False, "dropout": True},
     )

@@ -215,7 +215,7 @@ class MapTr(Host):
         """Return the predictions of the learned queries, and sow those of noised ones in training; in `decode`."""
         config, range_ = self.config, self.config.spec.bev_range
         start = LineQueries(config.decoder, range_, name="queries")()
-        rest = bev, None, tokens or {}, deterministic
+        rest = bev, tokens or {}, deterministic
         if config.denoising is None or lines is None or not self.is_mutable_collection(AUXILIARY):
             return self.decode_queries(start, *rest)
         taught = lines.of_classes(config.decoder.classes)
@@ -223,14 +223,13 @@ class MapTr(Host):
         return decode_groups(self, start, noised, *rest)
 
     def decode_queries(
-        self, start: PointQueries, bev: Float[Array, "h w e"], elements: None, tokens: ByPrior, deterministic: bool
+        self, start: PointQueries, bev: Float[Array, "h w e"], tokens: ByPrior, deterministic: bool
     ) -> Prediction:
         """Return the predictions of one set of queries.
 
         Args:
             start: I lines of P points: content and position (I, P, C), points (I, P, D) in [0, 1].
             bev: BEV features.
-            elements: None; the place of the traffic elements of other hosts, see `lane_denoising.decode_groups`.
             tokens: of the priors, by name.
             deterministic: no dropout.
         """

@@ -106,7 +106,7 @@ class MapTrV2(MapTr):
         start = LineQueries(config.decoder, config.spec.bev_range, config.many, name="queries")()
         if not training:
             start = jax.tree.map(lambda leaf: leaf[:count], start)
-        found = turned(self.decode_queries(start, bev, None, tokens or {}, deterministic), level)
+        found = turned(self.decode_queries(start, bev, tokens or {}, deterministic), level)
         if training:
             self.sow(AUXILIARY, "one_to_many", jax.tree.map(lambda leaf: leaf[:, count:], found.lines))
         return jax.tree.map(lambda leaf: leaf[:, :count], found)
@@ -139,7 +139,7 @@ class DecoupledLayer(nn.Module):
         position: Float[Array, "i p c"],
         reference: Float[Array, "i p d"],
         bev: Float[Array, "h w e"],
-        groups: Bool[Array, "i i"] | None = None,
+        together: Bool[Array, "i i"] | None = None,
         *,
         deterministic: bool = True,
     ) -> Float[Array, "i p c"]:
@@ -149,7 +149,7 @@ class DecoupledLayer(nn.Module):
             queries, position: content of the queries and the position encoding added to it in attention.
             reference: points in [0, 1].
             bev: BEV features, row 0 at the smallest y, column 0 at the smallest x.
-            groups: which line may attend to which; None: all to all.
+            together: which line may attend to which; None: all to all.
             deterministic: no dropout.
         """
         config, (h, w, e) = self.config, bev.shape
@@ -168,7 +168,7 @@ class DecoupledLayer(nn.Module):
             module = attend(config.dim, config.heads, config.dropout, name=name)
             return add(name, queries, module(queries, queries + position, mask, deterministic))
 
-        queries = among(0, groups, "line_attention")
+        queries = among(0, together, "line_attention")
         queries = among(1, None, "point_attention")
         sample = DeformableAttention(config.dim, config.heads, config.sampling_points, name="bev_attention")
         placed = (queries + position).reshape(-1, config.dim)

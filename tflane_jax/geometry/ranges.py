@@ -12,7 +12,9 @@ from tflane_jax.limits import Count, Interval
 
 @dataclass(frozen=True)
 class PerceptionRange:
-    """Axis-aligned box in the ego frame, metres: R_p of TF-Lane (section 3.2).
+    """Axis-aligned box around the vehicle, metres: R_p of TF-Lane (section 3.2).
+
+    In the ego frame (x forward, y left); for a host that works in other axes, in these (`HostSpec`).
 
     Attributes:
         x, y, z: (low, high) of each axis, metres.

@@ -85,7 +85,7 @@ class LaneSegNetLossConfig(LaneWeights, HostLossConfig):
         segments = outputs.segments
         if segments is None or segments.mask_logits is None or segments.successor_logits is None:
             raise ValueError("LaneSegNet's loss needs predicted segments with masks and topology")
-        bev_range, shape = host.encoder.bev_range, segments.mask_logits.shape[-2:]
+        bev_range, shape = host.bev_range, segments.mask_logits.shape[-2:]
         classes = host.decoder.classes
         targets = jax.vmap(partial(ordered_targets, center=host.center, classes=classes))(batch.segments, batch.areas)
         masks = jax.vmap(partial(target_masks, shape=shape, range_=bev_range, raster=self.raster))(targets)

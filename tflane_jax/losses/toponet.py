@@ -86,7 +86,7 @@ def lane_graph_host_loss(
         host.auxiliary,
         batch.lanes,
         weights=config,
-        bev_range=host.encoder.bev_range,
+        bev_range=host.bev_range,
         denoising=partial(lane_denoising_losses, config=config, control_points=control_points),
     )
     for term in further:

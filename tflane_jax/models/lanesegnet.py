@@ -1,9 +1,9 @@
 """LaneSegNet (Li et al. 2024), with or without priors: lane segments with boundaries, line types and topology.
 
-Images -> BEV features -> segment queries -> (priors) -> decoder layers -> centerlines, boundaries, line types, classes,
-masks -> topology of the last layer. The small version reads BEV evidence instead of images; decoder, heads and losses
-are the same. The map-element-bucket variant has decoders of their own for areas and traffic elements.
-Source: docs/reference/lanesegnet.md.
+Images -> BEV encoder (SD map, markers, optional traffic raster) -> segment queries -> decoder layers (traffic flow
+before each) -> centerlines, boundaries, line types, classes, masks -> topology of the last layer. The small version
+reads BEV evidence instead of images; decoder, heads and losses are the same. The map-element-bucket variant has
+decoders of their own for areas and traffic elements. Source: docs/reference/lanesegnet.md.
 """
 
 from __future__ import annotations

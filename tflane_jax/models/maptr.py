@@ -1,8 +1,8 @@
 """MapTR (Liao et al. 2023), with or without priors: the lines of a vector map, by class.
 
-Images -> BEV features -> instance and point queries -> (priors) -> decoder layers, each moving all points -> classes
-and points of every layer. The small version reads BEV evidence instead of images; decoder, heads and losses are the
-same. Source: docs/reference/maptr.md.
+Images -> BEV encoder (SD map, markers, optional traffic raster) -> instance and point queries -> decoder layers, each
+moving all points (traffic flow before each) -> classes and points of every layer. The small version reads BEV evidence
+instead of images; decoder, heads and losses are the same. Source: docs/reference/maptr.md.
 """
 
 from __future__ import annotations

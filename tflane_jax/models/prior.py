@@ -30,8 +30,8 @@ class HostSpec:
 
     Attributes:
         dim: channels of a query.
-        range: R_p, the box in which lanes are perceived, metres.
-        bev_range: the box that the BEV features cover and that normalised coordinates span, metres.
+        range: R_p, the box in which lanes are perceived, in the host's axes, metres.
+        bev_range: the box that the BEV features cover and that normalised coordinates span, in the host's axes, metres.
         query_type: a query represents a whole lane ("instance": TopoNet, LaneSegNet) or one of its points ("point":
             MapTR), see TF-Lane, Eq. (3).
         bev_dim: channels of the BEV features; None for a prior that is used without them.

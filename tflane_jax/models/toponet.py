@@ -1,6 +1,7 @@
 """TopoNet (Li et al. 2023), with or without priors.
 
-Images -> BEV features -> lane queries -> (priors) -> decoder layers -> centerlines, scores, lane-lane topology.
+Images -> BEV encoder (SD map, markers, optional traffic raster) -> lane queries -> decoder layers (traffic flow before
+each) -> centerlines, scores, lane-lane topology.
 Front view -> traffic elements -> the decoder's scene graph -> lane-element topology.
 The small version reads BEV evidence instead of images and has no traffic elements; decoder, graph, heads and losses
 are the same. Source: docs/reference/toponet.md.

@@ -1,1 +1,4 @@
-"""Priors: raw observations -> arrays and masks of fixed size. No parameters; runs in numpy or under jit."""
+"""Priors: raw observations -> arrays and masks of fixed size. No parameters.
+
+Selection (`traffic_flow`, `markers`, `sd_map`) runs in numpy or under jit; rasters and memory are JAX.
+"""

@@ -17,7 +17,6 @@ from tests.slow import with_slow
 from tflane_jax.layers.image_graph import SIDES
 from tflane_jax.layers.masks import key_mask
 from tflane_jax.layers.transformer import EncoderLayer, TransformerConfig
-from tflane_jax.limits import SettingError
 from tflane_jax.models.graph_encoders import (
     GcnEncoderConfig,
     GraphEncoderLayer,
@@ -26,7 +25,6 @@ from tflane_jax.models.graph_encoders import (
     HeterogeneousAttention,
     MetaPathConvolution,
 )
-from tflane_jax.models.lstr import LstrConfig
 
 DIM, SHAPE, BLOCK = 8, (5, 6), (3, 4)
 GTN = GtnEncoderConfig(head_dim=4, hidden=16)
@@ -330,22 +328,3 @@ def test_number_of_parameters_at_lstrs_size(name):
     module, x = config.build("encoder"), jnp.zeros((12, 20, 32))
     variables = jax.eval_shape(module.init, jax.random.key(0), x, x, jnp.ones((12, 20), bool))
     assert sum(leaf.size for leaf in jax.tree.leaves(variables)) == PARAMETERS[name]
-
-
-@pytest.mark.parametrize(
-    ("config", "message"),
-    [
-        (GtnEncoderConfig(channels=3), r"^encoder\.channels is 3: it must be a divisor of dim \(8\)"),
-        (GtnEncoderConfig(heads=5), r"^encoder\.heads is 5: it must be a divisor of dim \(8\)"),
-        (HanEncoderConfig(heads=3), r"^encoder\.heads is 3: it must be a divisor of dim \(8\)"),
-        (GtnEncoderConfig(relations=(), similarity=None), r"^encoder\.relations is \(\): it must be at least one, or"),
-        (
-            GtnEncoderConfig(relations=()),
-            r"^encoder\.relations is \(\): it must be at least one, or similarity every_hop",
-        ),
-        (HanEncoderConfig(relations=()), r"^encoder\.relations is \(\): it must be .*at least one of them"),
-    ],
-)
-def test_impossible_configs_are_named(config, message):
-    with pytest.raises(SettingError, match=message):
-        LstrConfig(dim=DIM, encoder=config).build()

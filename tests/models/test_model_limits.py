@@ -8,6 +8,8 @@ from tests.models.cases import BASELINE, CAMERA_TOPONET, LIFTED_LINES, SEGMENTS,
 from tflane_jax.limits import SettingError, check_settings
 from tflane_jax.models.area_decoder import AreaDecoderConfig
 from tflane_jax.models.bev_encoder import SMALL_BEVFORMER
+from tflane_jax.models.graph_encoders import GtnEncoderConfig, HanEncoderConfig
+from tflane_jax.models.lstr import LstrConfig
 from tflane_jax.models.maptr import MapTrConfig
 
 
@@ -66,3 +68,22 @@ def test_channels_of_the_lift_encode_positions():
     narrow = changed(LIFTED_LINES, "encoder.images.pyramid.dim", 18)
     with pytest.raises(SettingError, match=r"^encoder\.bev\.dim is 18: it must be a multiple of 4"):
         changed(narrow, "encoder.bev.dim", 18).build()
+
+
+@pytest.mark.parametrize(
+    ("encoder", "message"),
+    [
+        (GtnEncoderConfig(channels=3), r"^encoder\.channels is 3: it must be a divisor of dim \(8\)"),
+        (GtnEncoderConfig(heads=5), r"^encoder\.heads is 5: it must be a divisor of dim \(8\)"),
+        (HanEncoderConfig(heads=3), r"^encoder\.heads is 3: it must be a divisor of dim \(8\)"),
+        (GtnEncoderConfig(relations=(), similarity=None), r"^encoder\.relations is \(\): it must be at least one, or"),
+        (
+            GtnEncoderConfig(relations=()),
+            r"^encoder\.relations is \(\): it must be at least one, or similarity every_hop",
+        ),
+        (HanEncoderConfig(relations=()), r"^encoder\.relations is \(\): it must be .*at least one of them"),
+    ],
+)
+def test_impossible_encoders_of_lstr_are_named(encoder, message):
+    with pytest.raises(SettingError, match=message):
+        LstrConfig(dim=8, encoder=encoder).build()

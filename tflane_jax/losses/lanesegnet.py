@@ -120,7 +120,10 @@ class LaneSegNetLossConfig(LaneWeights, HostLossConfig):
         """Return the loss of traffic elements and of their topology with the segments, and its terms."""
         elements, size = true_elements(batch)
         if elements.segment is None:
-            raise UserError("this loss needs traffic elements that govern segments (ExampleConfig.elements_of)")
+            raise UserError(
+                "this loss needs traffic elements that govern segments: set data.example.elements_of to segments "
+                "(built-in world), or the flavour of OpenLane-V2 (data.flavour)"
+            )
         elements = clear_padding(elements)
         found = assign_elements(prediction, elements, size, self.elements, self.matcher)
         terms = element_losses(prediction, found, elements, size, self.elements)

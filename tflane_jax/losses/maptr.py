@@ -73,7 +73,10 @@ class MapTrLossConfig(HostLossConfig):
         if outputs.lines is None:
             raise ValueError("MapTR's loss needs predicted map lines")
         if batch.map_lines is None:
-            raise UserError("the model learns the lines of a vector map, and these data have none (map_lines is None)")
+            raise UserError(
+                "the model learns the lines of a vector map, and these data have none (map_lines is None): set "
+                "data.example.map_lines"
+            )
         lines, range_ = batch.map_lines, host.bev_range
         coordinates, classes = outputs.lines.points.shape[-1], outputs.lines.logits.shape[-1]
         targets = jax.vmap(partial(line_targets, coordinates=coordinates, classes=classes, rings=self.rings))(lines)

@@ -207,7 +207,10 @@ def element_lane_loss(
     if prediction.lane_logits is None:
         raise ValueError("this loss needs a host that predicts lane-element topology (lane_logits)")
     if elements.lane is None:
-        raise UserError("this loss needs traffic elements that govern centerlines (ExampleConfig.elements_of)")
+        raise UserError(
+            "this loss needs traffic elements that govern centerlines: set data.example.elements_of to centerlines "
+            "(built-in world), or the flavour of OpenLane-V2 (data.flavour)"
+        )
     layers = prediction.lane_logits.shape[1]
     edges = elements.lane & lanes.valid[:, :, None] & elements.valid[:, None, :]
     rows, columns = last_layers(lane_assignment, layers), last_layers(element_assignment, layers)

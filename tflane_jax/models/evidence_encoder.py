@@ -90,7 +90,10 @@ class EvidenceEncoder(nn.Module):
         """
         (h, w, c), n = bev.shape, self.config.cell
         if h % n or w % n:
-            raise ValueError(f"a raster of {h} x {w} cells does not fold into blocks of {n} x {n}")
+            raise ValueError(
+                f"a raster of {h} x {w} cells does not fold into blocks of {n} x {n}: choose a `cell` that divides "
+                "both sides"
+            )
         x = bev.astype(jnp.float32) / 255.0
         # Folding is lossless and avoids convolutions at full resolution, the most expensive ones on a CPU.
         x = x.reshape(h // n, n, w // n, n, c).transpose(0, 2, 1, 3, 4).reshape(h // n, w // n, n * n * c)

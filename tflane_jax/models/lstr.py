@@ -246,7 +246,10 @@ def shrink(
         return image, valid
     height, width = valid.shape
     if height % side or width % side:
-        raise ValueError(f"an image of {height} x {width} does not shrink by blocks of {side} x {side}")
+        raise ValueError(
+            f"an image of {height} x {width} does not shrink by blocks of {side} x {side}: choose a `shrink` that "
+            "divides both sides"
+        )
     blocks = (height // side, side, width // side, side)
     pixels = image.reshape(height // side, side, width // side, side * 3)
     parts = [pixels[:, i, :, 3 * j : 3 * j + 3] for i in range(side) for j in range(side)]

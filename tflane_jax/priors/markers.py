@@ -100,7 +100,10 @@ def select_marker_lanes(markers: MarkerObservations, config: MarkerPriorConfig) 
     xp = namespace(markers.lanes, markers.valid)
     count, lanes, points = markers.lanes.shape[:3]
     if points < config.points:
-        raise ValueError(f"the markers' lanes have {points} points, the prior asks for {config.points}")
+        raise ValueError(
+            f"the markers' lanes have {points} points, the prior asks for {config.points}: raise "
+            "data.example.markers.points or lower priors.markers.prior.points"
+        )
     valid = (markers.lane_valid & markers.valid[:, None]).reshape(-1)
     flat = markers.lanes[..., :2].reshape(count * lanes, points, 2)[:, stride(points, config.points)]
     flat = xp.where(valid[:, None, None], flat, 0.0)

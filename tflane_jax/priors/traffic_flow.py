@@ -102,7 +102,10 @@ def select_traffic_flow(
     xp = namespace(flow.position, flow.valid)
     recorded = flow.valid.shape[1]
     if recorded < config.frames:
-        raise ValueError(f"the traffic flow holds {recorded} frames, the prior asks for {config.frames}")
+        raise ValueError(
+            f"the traffic flow holds {recorded} frames, the prior asks for {config.frames}: raise "
+            "ExampleConfig.history or lower TrafficFlowPriorConfig.frames"
+        )
     if flow.valid.shape[0] == 0:
         flow = TrafficFlow.empty(1, recorded)  # the padding below needs a row to index
     flow = TrafficFlow(

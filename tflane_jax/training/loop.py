@@ -170,7 +170,7 @@ def train(
     optim = scaled_to_batch(optim, config.batch_size)
     adaptive = None if optim.restarts is None or optim.restarts.adaptive is None else optim.restarts
     if adaptive is not None and evaluate is None:
-        raise UserError("optim.restarts.adaptive needs evaluations, and this training has none")
+        raise UserError("optim.restarts.adaptive needs evaluations: pass `evaluate`, or set it to None")
     optimizer = make_optimizer(optim, config.steps)
     with contextlib.ExitStack() as stack, showing(progress), StopRequest() as stop:
         # =============================================================================================================

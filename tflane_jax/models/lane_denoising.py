@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 from tflane_jax.geometry import PerceptionRange, transform_points, yaw_pose
 from tflane_jax.limits import Count, Fraction, PositiveOrZero
 from tflane_jax.models.auxiliary import AUXILIARY
-from tflane_jax.models.lane_queries import LaneDecoderConfig
+from tflane_jax.models.lane_queries import LaneDecoderConfig, LaneStart
 from tflane_jax.scene import LaneGraph, MapLines, Prediction
 
 
@@ -57,10 +57,8 @@ class NoisedQueries(nn.Module):
     range: PerceptionRange
 
     @nn.compact
-    def __call__(
-        self, lanes: LaneGraph
-    ) -> tuple[Float[Array, "g q c"], Float[Array, "g q c"], Float[Array, "g q p 3"]]:
-        """Return content, position and reference points in [0, 1] of every copy (G); query i belongs to lane i."""
+    def __call__(self, lanes: LaneGraph) -> LaneStart:
+        """Return the queries of every copy, as a leading axis; query i of a copy belongs to lane i."""
         config, copies = self.config, self.noise.copies
         keys = jax.random.split(self.make_rng("dropout"), copies)
         lines = jax.vmap(lambda key: noised_lanes(key, lanes, config.queries, self.range, self.noise))(keys)
@@ -72,7 +70,7 @@ class NoisedQueries(nn.Module):
             middle = config.points // 2
             reference = jnp.broadcast_to(reference[:, :, middle : middle + 1], reference.shape)
         content = self.param("content", nn.initializers.normal(1.0), (config.dim,), jnp.float32)
-        return jnp.broadcast_to(content, position.shape), position, lax.stop_gradient(reference)
+        return LaneStart(jnp.broadcast_to(content, position.shape), position, lax.stop_gradient(reference))
 
 
 def decode_groups(host: Any, start: Any, noised: Any, *arguments: Any) -> Prediction:

@@ -22,12 +22,9 @@ from tflane_jax.models.element_decoder import ElementOutput
 from tflane_jax.models.host import Host, HostConfig
 from tflane_jax.models.lane_denoising import DenoisingConfig, NoisedQueries, decode_groups
 from tflane_jax.models.lane_proposals import LaneProposals
-from tflane_jax.models.lane_queries import LaneDecoderConfig, LaneQueries
+from tflane_jax.models.lane_queries import LaneDecoderConfig, LaneQueries, LaneStart
 from tflane_jax.models.priors import ByPrior
 from tflane_jax.scene import Example, LaneGraph, Prediction
-
-LaneStart = tuple[Float[Array, "q c"], Float[Array, "q c"], Float[Array, "q p 3"]]
-"""Queries before the first layer: content, position, and lanes in [0, 1] of the BEV range."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -23,7 +23,7 @@ from tflane_jax.layers.graph import Mlp
 from tflane_jax.limits import SettingError
 from tflane_jax.models.auxiliary import AUXILIARY, LaneProposalOutputs
 from tflane_jax.models.lane_decoder import smooth_basis
-from tflane_jax.models.lane_queries import LaneDecoderConfig, LaneProposalConfig
+from tflane_jax.models.lane_queries import LaneDecoderConfig, LaneProposalConfig, LaneStart
 from tflane_jax.scene import LaneGraph
 
 # Half the length of the straight lane that the untrained shape head proposes, metres.
@@ -42,10 +42,8 @@ class LaneProposals(nn.Module):
     range: PerceptionRange
 
     @nn.compact
-    def __call__(
-        self, bev: Float[Array, "h w e"], lanes: LaneGraph | None
-    ) -> tuple[Float[Array, "q c"], Float[Array, "q c"], Float[Array, "q p 3"]]:
-        """Return content, position and reference points in [0, 1] of the proposed queries, best first.
+    def __call__(self, bev: Float[Array, "h w e"], lanes: LaneGraph | None) -> LaneStart:
+        """Return the proposed queries, best first.
 
         Sows the auxiliary output `lane_proposals` if lanes are given and the collection is mutable.
 
@@ -90,7 +88,7 @@ class LaneProposals(nn.Module):
         if config.refine == "fixed":  # all layers look at one point
             middle = config.points // 2
             reference = jnp.broadcast_to(reference[:, middle : middle + 1], reference.shape)
-        return content, position, reference
+        return LaneStart(content, position, reference)
 
     def _centers(self, h: int, w: int) -> Float[np.ndarray, "q 2"]:
         """Return the centres of all cells, metres."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple
 
 import flax.linen as nn
 import jax.numpy as jnp
@@ -95,6 +95,19 @@ PAPER_LANE_DECODER = LaneDecoderConfig(
 )
 
 
+class LaneStart(NamedTuple):
+    """The queries of Q lanes before the first layer.
+
+    Attributes:
+        content, position: (Q, C); the position is added to the content in attention.
+        reference: (Q, P, 3) lanes in [0, 1] of the BEV range.
+    """
+
+    content: Float[Array, "*b q c"]
+    position: Float[Array, "*b q c"]
+    reference: Float[Array, "*b q p 3"]
+
+
 class LaneQueries(nn.Module):
     """The learned queries: content, position and reference points.
 
@@ -107,8 +120,8 @@ class LaneQueries(nn.Module):
     range: PerceptionRange
 
     @nn.compact
-    def __call__(self) -> tuple[Float[Array, "q c"], Float[Array, "q c"], Float[Array, "q p 3"]]:
-        """Return content, position and initial reference points in [0, 1].
+    def __call__(self) -> LaneStart:
+        """Return content, position and initial reference points.
 
         "fixed": one point per lane, a linear function of the position; "iterative": learned anchor lanes.
         """
@@ -120,10 +133,10 @@ class LaneQueries(nn.Module):
         if config.refine == "iterative":
             start = spread_lanes(config.learned_queries, config.points, self.range)
             anchors = self.param("anchors", lambda _: inverse_sigmoid(jnp.asarray(start, jnp.float32)))
-            return content, position, nn.sigmoid(anchors)
+            return LaneStart(content, position, nn.sigmoid(anchors))
         spot = nn.sigmoid(nn.Dense(3, kernel_init=nn.initializers.xavier_uniform(), name="reference")(position))
         shape = (config.learned_queries, config.points, 3)
-        return content, position, jnp.broadcast_to(spot[:, None], shape)
+        return LaneStart(content, position, jnp.broadcast_to(spot[:, None], shape))
 
 
 def spread_lanes(count: int, points: int, range_: PerceptionRange, length: float = 24.0) -> Float[np.ndarray, "q p 3"]:

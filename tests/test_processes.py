@@ -238,7 +238,7 @@ def test_outside_of_a_cluster_the_options_are_named(monkeypatch):
 
 
 def test_a_process_on_its_own_is_the_first():
-    assert (processes.count(), processes.is_first()) == (1, True)
+    assert (processes.process_count(), processes.is_first()) == (1, True)
     assert processes.from_first(lambda: {"a": [1, None]}) == {"a": [1, None]}
     assert processes.stop_signal(15, 3) == 15
     assert processes.stop_signal(None, 3) is None

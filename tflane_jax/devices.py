@@ -55,7 +55,7 @@ def prediction_mesh(batch_size: int) -> Mesh | None:
     A process that works `apart` from the others has no mesh either.
     """
     devices = jax.devices()
-    if len(devices) == 1 or batch_size % len(devices) or processes.count() < jax.process_count():
+    if len(devices) == 1 or batch_size % len(devices) or processes.process_count() < jax.process_count():
         return None
     return Mesh(np.array(devices), (DATA_AXIS,), axis_types=(AxisType.Auto,))
 
@@ -138,7 +138,7 @@ def of_one_process(tree: Any) -> Any:
 
     Of several processes, each gets arrays of its host: a state that is in parts may not fit on one device.
     """
-    return tree if processes.count() == 1 else jax.tree.map(_on_host, tree)
+    return tree if processes.process_count() == 1 else jax.tree.map(_on_host, tree)
 
 
 def _on_host(leaf: Any) -> Any:

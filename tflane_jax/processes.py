@@ -85,7 +85,7 @@ def join(coordinator: str | None, processes: int | None, process: int | None) ->
     jax.config.update("jax_enable_compilation_cache", False)
 
 
-def count() -> int:
+def process_count() -> int:
     """Return the number of processes that work together; 1 inside `apart`."""
     return 1 if _apart.get() else jax.process_count()
 
@@ -107,7 +107,7 @@ def apart() -> Iterator[None]:
 
 def from_first(make: Callable[[], T]) -> T:
     """Call `make` in the first process and return its result, plain JSON, in all; an error is raised in all."""
-    if count() == 1:
+    if process_count() == 1:
         return make()
     answer: dict[str, Any] = {}
     error: Exception | None = None
@@ -128,7 +128,7 @@ def agreed() -> Iterator[None]:
 
     The processes wait for each other there; the block itself may not wait for other processes.
     """
-    if count() == 1:
+    if process_count() == 1:
         yield
         return
     from jax.experimental import multihost_utils
@@ -157,7 +157,7 @@ def leaving() -> Iterator[None]:
     except AgreedError:
         raise
     except Exception as error:
-        if count() == 1:
+        if process_count() == 1:
             raise
         if isinstance(error, UserError):
             print(f"tflane: {error}", file=sys.stderr)
@@ -171,7 +171,7 @@ def leaving() -> Iterator[None]:
 
 def end_alone(code: int) -> None:
     """End this process at once if it is one of several, which wait for it: JAX ends them. No-op for a single one."""
-    if count() > 1:
+    if process_count() > 1:
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(code)
@@ -193,7 +193,7 @@ def arrays_from_first(make: Callable[[], T], like: T) -> T:
         make: returns the arrays.
         like: a tree of the same structure, shapes and types.
     """
-    if count() == 1:
+    if process_count() == 1:
         return make()
     held = like
 
@@ -211,7 +211,7 @@ def all_rows(tree: Any) -> Any:
     They are exchanged as bytes, so that no type changes.
     """
     leaves, treedef = jax.tree.flatten(tree)
-    if count() == 1 or not leaves:
+    if process_count() == 1 or not leaves:
         return tree
     from jax.experimental import multihost_utils
 
@@ -231,7 +231,7 @@ def stop_signal(signal: int | None, step: int) -> int | None:
 
     Several processes exchange it every `AGREE_EVERY` steps, so that they do not wait for each other at every step.
     """
-    if count() == 1:
+    if process_count() == 1:
         return signal
     if step % AGREE_EVERY:
         return None

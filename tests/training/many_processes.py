@@ -81,7 +81,7 @@ def main() -> None:
     except UserError as error:
         print(json.dumps({"error": str(error)}))
         return
-    print(json.dumps(dataclasses.asdict(result) | {"processes": processes.count()}))
+    print(json.dumps(dataclasses.asdict(result) | {"processes": processes.process_count()}))
 
 
 if __name__ == "__main__":

@@ -15,6 +15,7 @@ from tflane_jax.commands.outputs import check_output, check_table, folders_of
 from tflane_jax.commands.sources import opened, source_for
 from tflane_jax.config_io import settings
 from tflane_jax.datasets import sources
+from tflane_jax.datasets.photos import HEIGHT, WIDTH
 from tflane_jax.errors import UserError
 from tflane_jax.export import (
     Program,
@@ -33,7 +34,6 @@ from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.tasks.lane_shape import LaneShapeTask
 from tflane_jax.training.runtime import configure_jax
 
-HEIGHT, WIDTH = 360, 640
 _TOLERANCE, _OF_HALVES = 1e-3, 0.1
 """Two compiled programs of one model differ by rounding, which its layers amplify; 1.5e-5 was seen in float32."""
 _SUFFIX = ".stablehlo"

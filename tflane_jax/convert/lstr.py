@@ -22,7 +22,7 @@ from tflane_jax.errors import UserError
 from tflane_jax.geometry.namespace import AnyArray
 from tflane_jax.layers.transformer import TransformerConfig
 from tflane_jax.models.graph_encoders import GtnEncoderConfig
-from tflane_jax.models.lstr import EncoderConfig, LstrConfig, TransformerEncoderConfig
+from tflane_jax.models.lstr import LaneShapeEncoderConfig, LstrConfig, TransformerEncoderConfig
 from tflane_jax.models.parameters import Params
 
 RESNET = (
@@ -74,7 +74,7 @@ _PUBLISHED = (*_AROUND_THE_ENCODER, *below(_ENCODER, r"encoder/layer_\1", ENCODE
 
 
 def convert_lstr(
-    state: Mapping[str, AnyArray], encoder: EncoderConfig | None = None, edge_weight: float = 1.0
+    state: Mapping[str, AnyArray], encoder: LaneShapeEncoderConfig | None = None, edge_weight: float = 1.0
 ) -> Converted:
     """Return the variables of `Lstr` (with `frozen_stem_norm`) and an account of every tensor.
 

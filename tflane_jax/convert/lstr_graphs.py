@@ -22,11 +22,10 @@ from tflane_jax.errors import UserError
 from tflane_jax.geometry.namespace import AnyArray
 from tflane_jax.models.graph_encoders import (
     GcnEncoderConfig,
-    GraphEncoderConfig,
     GtnEncoderConfig,
     HanEncoderConfig,
 )
-from tflane_jax.models.lstr import LstrConfig, TransformerEncoderConfig
+from tflane_jax.models.lstr import LaneShapeEncoderConfig, LstrConfig, TransformerEncoderConfig
 
 HEADS = 2
 """Of LSTR's attention; its weights do not tell."""
@@ -92,7 +91,7 @@ def selections(encoder: GtnEncoderConfig, edge_weight: float) -> Float[np.ndarra
 
 
 def as_graph_state(
-    state: Mapping[str, AnyArray], encoder: GraphEncoderConfig | TransformerEncoderConfig
+    state: Mapping[str, AnyArray], encoder: LaneShapeEncoderConfig
 ) -> tuple[Mapping[str, AnyArray], dict[str, str]]:
     """Return tensors for the rules of `GRAPH_LAYER`, and what the account says about those that a product replaces."""
     if isinstance(encoder, (GtnEncoderConfig, TransformerEncoderConfig)):

@@ -23,7 +23,7 @@ from tflane_jax.layers.resnet import ResNet, ResNetConfig
 from tflane_jax.layers.transformer import DecoderLayer, EncoderLayer, TransformerConfig
 from tflane_jax.limits import INCREASING, Count, Fraction, Rules, check_settings, splits
 from tflane_jax.models.auxiliary import AUXILIARY, AuxiliaryName
-from tflane_jax.models.graph_encoders import GcnEncoderConfig, GtnEncoderConfig, HanEncoderConfig
+from tflane_jax.models.graph_encoders import GraphEncoderConfig
 from tflane_jax.scene import CurvePrediction
 
 # Mean and deviation of values in [0, 1], in BGR order: CornerNet's, which LSTR took over.
@@ -53,7 +53,7 @@ class TransformerEncoderConfig:
 _TYPICAL = np.array([0.38, 0.95, 0.0, 0.3, 0.0, 0.5, 0.0, 0.0], np.float32)
 _SPREAD = np.array([0.05, 0.1, 1e-5, 0.03, 2e-3, 0.05, 0.1, 1.0], np.float32)
 
-EncoderConfig = TransformerEncoderConfig | GtnEncoderConfig | GcnEncoderConfig | HanEncoderConfig
+LaneShapeEncoderConfig = TransformerEncoderConfig | GraphEncoderConfig
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ class LstrConfig:
 
     backbone: ResNetConfig = ResNetConfig()
     dim: Count = 32
-    encoder: EncoderConfig = TransformerEncoderConfig()
+    encoder: LaneShapeEncoderConfig = TransformerEncoderConfig()
     decoder_layers: Count = 2
     decoder: TransformerConfig = TransformerConfig()
     queries: Count = 7

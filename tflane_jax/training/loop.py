@@ -16,13 +16,14 @@ from typing import Annotated, Any
 
 import numpy as np
 
+from tflane_jax import processes
 from tflane_jax.datasets.batches import Prepare, batches, first_example
 from tflane_jax.datasets.batches import count as example_count
 from tflane_jax.devices import divided, of_one_process, share, training_mesh
 from tflane_jax.errors import UserError
 from tflane_jax.limits import DIFFERENT, NOT_EMPTY, Count, Rules, Seed, check_settings, splits
 from tflane_jax.models.parameters import Params
-from tflane_jax.processes import AgreedError, agreed, apart, arrays_from_first, count, from_first, is_first, stop_signal
+from tflane_jax.processes import AgreedError, agreed, apart, arrays_from_first, from_first, is_first, stop_signal
 from tflane_jax.progress import progress_bar
 from tflane_jax.startup import ready, showing, stage
 from tflane_jax.training.adaptive import Memory
@@ -183,7 +184,7 @@ def train(
                 read_records(folder / "metrics.jsonl")  # if it is damaged, say so before compiling
 
         from_first(claim)
-        if count() == 1:
+        if processes.process_count() == 1:
             stop.at_once()
         checkpoints = Checkpoints(folder / "checkpoints", keep=config.keep_checkpoints, best_metric=config.best_metric)
 
@@ -262,7 +263,7 @@ def train(
             try:
                 return next(feed, None)
             except Exception as error:
-                if count() > 1:  # the other processes would wait for this one
+                if processes.process_count() > 1:  # the other processes would wait for this one
                     raise
                 unread = error  # to be raised when this step is recorded and saved
                 return None
@@ -281,7 +282,7 @@ def train(
                 try:
                     measured = [evaluate(state.ema_params) for state in states]  # several processes predict together
                 except Exception:
-                    if count() == 1:  # several would wait for one another
+                    if processes.process_count() == 1:  # several would wait for one another
                         save({}, due=True)  # a resumed run begins with this evaluation
                     raise
                 evaluations = from_first(lambda: measured)
@@ -309,9 +310,8 @@ def train(
                 states, values = update_all(update, states, batch)
                 if not values["finite"].all():
                     save({})
-                    raise AgreedError(
-                        not_finite(values, step, config.seeds, checkpoints.path(step), batch if count() == 1 else ())
-                    )
+                    searched = batch if processes.process_count() == 1 else ()
+                    raise AgreedError(not_finite(values, step, config.seeds, checkpoints.path(step), searched))
                 step += 1
                 window.add({name: value for name, value in values.items() if name != "finite"})
                 asked = time.perf_counter()

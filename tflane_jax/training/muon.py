@@ -38,15 +38,15 @@ class MuonState(NamedTuple):
     mu: Any
 
 
-def same(vectors: Vectors) -> Vectors:
+def identity(vectors: Vectors) -> Vectors:
     """Return the vectors as they are."""
     return vectors
 
 
-def scale_by_muon(whole: Callable[[Vectors], Vectors] = same) -> optax.GradientTransformation:
+def scale_by_muon(gather: Callable[[Vectors], Vectors] = identity) -> optax.GradientTransformation:
     """Return Muon with Nesterov momentum for `Vectors`; updates have a root mean square of about 0.2, like Adam's.
 
-    `whole` gathers vectors that several devices share: before matrices are made orthogonal, and after, so that every
+    `gather` gathers vectors that several devices share: before matrices are made orthogonal, and after, so that every
     device makes all of them.
     """
 
@@ -61,7 +61,7 @@ def scale_by_muon(whole: Callable[[Vectors], Vectors] = same) -> optax.GradientT
             optax.tree.bias_correction(mu, _MOMENTUM, count + 1),
             optax.tree.bias_correction(updates, _MOMENTUM, count),
         )
-        return whole(orthogonal(whole(ahead))), MuonState(count, mu)
+        return gather(orthogonal(gather(ahead))), MuonState(count, mu)
 
     return optax.GradientTransformation(init, update)  # pyright: ignore[reportArgumentType]
 

@@ -31,7 +31,7 @@ from tflane_jax.limits import (
     SettingError,
     check_settings,
 )
-from tflane_jax.training.muon import same, scale_by_muon
+from tflane_jax.training.muon import identity, scale_by_muon
 from tflane_jax.training.rate_factors import Factors, scale_by_factors
 from tflane_jax.training.restarts import (
     Cycle,
@@ -208,7 +208,7 @@ def warmup_factor(config: OptimConfig, step: Int[ArrayLike, "..."]) -> Float[Arr
 
 
 def make_optimizer(
-    config: OptimConfig, steps: int, *, whole: Callable[[Vectors], Vectors] = same
+    config: OptimConfig, steps: int, *, gather: Callable[[Vectors], Vectors] = identity
 ) -> optax.GradientTransformation:
     """Return the gradient transformation of a run of `steps` updates, for `Vectors`.
 
@@ -216,7 +216,7 @@ def make_optimizer(
 
     Args:
         config, steps: of the run.
-        whole: see `scale_by_muon`.
+        gather: see `scale_by_muon`.
 
     Raises:
         UserError: a setting cannot work, see `make_schedule` and `RestartsConfig`.
@@ -226,7 +226,7 @@ def make_optimizer(
     decay = _decay_trained_leaves(config.weight_decay)
     if config.decayed == "kernels":
         decay = optax.masked(decay, is_decayed)
-    adam = _preconditioner(config, whole)
+    adam = _preconditioner(config, gather)
     return optax.chain(
         _clip_by_norm(config.clip_norm),
         optax.chain(*((adam, decay) if config.decay == "decoupled" else (decay, adam)), _scale_by_rate(config, steps)),
@@ -260,7 +260,7 @@ def _decay_trained_leaves(rate: float) -> optax.GradientTransformation:
     return optax.GradientTransformation(lambda params: optax.EmptyState(), update)
 
 
-def _preconditioner(config: OptimConfig, whole: Callable[[Vectors], Vectors]) -> optax.GradientTransformation:
+def _preconditioner(config: OptimConfig, gather: Callable[[Vectors], Vectors]) -> optax.GradientTransformation:
     """Return Adam, or Muon for kernels beside Adam for the rest."""
     adam = optax.scale_by_adam(b1=config.b1, b2=config.b2, eps=config.eps)
     if config.optimizer == "adam":
@@ -270,7 +270,7 @@ def _preconditioner(config: OptimConfig, whole: Callable[[Vectors], Vectors]) ->
     def labels(params: Any) -> Any:
         return params.map(lambda group, _: "muon" if group in kernels else "adam")
 
-    return optax.partition({"adam": adam, "muon": scale_by_muon(whole)}, labels)
+    return optax.partition({"adam": adam, "muon": scale_by_muon(gather)}, labels)
 
 
 def _scale_by_rate(config: OptimConfig, steps: int) -> optax.GradientTransformation:

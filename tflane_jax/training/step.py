@@ -152,7 +152,7 @@ def _traced_once(update: UpdateStep) -> UpdateStep:
 
 
 def _update(task: Trainable, optim: OptimConfig, steps: int, accumulate: int, division: Division) -> UpdateStep:
-    optimizer, rate = make_optimizer(optim, steps, whole=division.gathered), make_rate(optim, steps)
+    optimizer, rate = make_optimizer(optim, steps, gather=division.gathered), make_rate(optim, steps)
 
     def update(state: TrainState, batch: Any) -> tuple[TrainState, Metrics]:
         key, params = stream(state.key, "dropout", state.step), division.gathered(state.learned).tree()

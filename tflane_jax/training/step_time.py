@@ -57,7 +57,7 @@ class StepTime:
         if self.told or fraction <= _MUCH or waited < _LEAST_SECONDS or not isinstance(arrays, Streamed):
             return []
         self.told, (threads, _), others = True, arrays.config.workers(), arrays.config.processes
-        place = f"process {jax.process_index()}, " if processes.count() > 1 else ""
+        place = f"process {jax.process_index()}, " if processes.process_count() > 1 else ""
         workers = f"{threads} threads" + (f" in each of {others} processes" if others else "")
         return [
             f"{place}step {step}: {fraction:.0%} of the time, training waits for examples, which {workers} load: raise "

@@ -148,7 +148,7 @@ def with_traffic_in_bev(kind: type[EvidenceEncoderConfig]) -> LaneGraphTask:
 
 def test_the_encoder_of_the_page_takes_priors():
     page = (ROOT / "docs" / "architecture.md").read_text("utf-8")
-    (code,) = [block for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "fuse(" in block]
+    (code,) = [block for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "fuse_priors(" in block]
     names: dict[str, Any] = {}
     exec(compile(code, "architecture.md", "exec"), names)
     task = with_traffic_in_bev(names["PatchEncoderConfig"])
@@ -161,7 +161,7 @@ def test_the_encoder_of_the_page_takes_priors():
 
 
 def test_an_encoder_that_leaves_priors_out_is_an_error():
-    with pytest.raises(UserError, match=r"PlainEncoder never calls `fuse` of layer 0.*task\.model\.priors"):
+    with pytest.raises(UserError, match=r"PlainEncoder never calls `fuse_priors` for layer 0.*task\.model\.priors"):
         shaped(with_traffic_in_bev(PlainEncoderConfig), make_example(0))
 
 

@@ -255,7 +255,7 @@ def test_a_prior_without_data_changes_no_bit_of_the_features():
 
     def fuse_of(touched):
         raster = TrafficRaster(noise, touched)
-        return lambda layer, places, bev, position: RasterFusion(RASTER.hidden, name="prior")(
+        return lambda layer, shape, bev, position: RasterFusion(RASTER.hidden, name="prior")(
             bev, raster.features, raster.touched
         )
 

@@ -24,8 +24,8 @@ from tests.shared import assert_same
 from tflane_jax.errors import UserError
 from tflane_jax.limits import Rules, SettingError, splits
 from tflane_jax.models.bevformer_detr import BevFormerDetrConfig
-from tflane_jax.models.prior import HostQueries, HostSpec, Prior
-from tflane_jax.models.priors import PriorsConfig, encode, fuse_into_queries, observe, observe_clip
+from tflane_jax.models.prior import HostQueries, HostSpec, Prior, fuse_priors
+from tflane_jax.models.priors import PriorsConfig, bev_hook, encode, fuse_into_queries, observe, observe_clip
 from tflane_jax.models.traffic_flow_module import TrafficFlowConfig, TrafficFlowModuleConfig
 from tflane_jax.priors.traffic_flow import TrafficFlowPriorConfig
 from tflane_jax.scene import stack_examples
@@ -134,6 +134,33 @@ def test_memories_go_from_frame_to_frame_of_a_clip_and_of_a_stream():
     _, answers = jax.jit(lambda p, c: lax.scan(lambda m, e: task.step(p, m, e), task.start(), c))(params, clip)
     alone = jax.jit(task.predict)(params, frames[2])
     assert not np.array_equal(answers.centerlines.points[2], alone.centerlines.points)
+
+
+def test_cells_are_those_of_the_features_row_by_row():
+    """Regression: the number of rows and columns was guessed from coordinates that the encoder gave."""
+    spec, seen = BASELINE.spec, []
+
+    class Reading(Prior):
+        def into_bev(self, tokens, layer, cells):
+            seen.append((layer, cells))
+            return 2.0 * cells.features
+
+    bev = jnp.arange(24.0).reshape(2, 4, 3)
+    fuse = bev_hook({"mine": Reading()}, {"mine": None}, spec)
+    np.testing.assert_array_equal(fuse_priors(fuse, 1, bev, lambda: jnp.ones((8, 3))), 2.0 * bev)
+    ((layer, cells),) = seen
+    assert (layer, cells.grid.rows, cells.grid.columns, cells.grid.range) == (1, 2, 4, spec.bev_range)
+    assert (cells.position == 1.0).all()
+    (dx, dy), (x0, y0) = cells.grid.cell, spec.bev_range.low(2)
+    for row, column in np.ndindex(2, 4):
+        center = x0 + (column + 0.5) * dx, y0 + (row + 0.5) * dy
+        np.testing.assert_allclose(cells.centers[4 * row + column], center, rtol=1e-6)
+        np.testing.assert_array_equal(cells.features[4 * row + column], bev[row, column])
+
+
+def test_without_a_hook_no_position_is_encoded():
+    bev = jnp.arange(24.0).reshape(2, 4, 3)
+    np.testing.assert_array_equal(fuse_priors(None, 0, bev, lambda: pytest.fail("encoded positions")), bev)
 
 
 @pytest.mark.parametrize(("found", "shown"), [(jnp.zeros((6, 1)), r"an array of shape \(6, 1\)"), (None, "NoneType")])

@@ -45,7 +45,7 @@ def test_encoding_of_points_is_equation_one(layout):
 def fused_with(config, tokens, valid):
     """Return the callback of a BEV encoder that fuses these tokens."""
 
-    def fuse(layer, places, bev, position):
+    def fuse(layer, shape, bev, position):
         return SdMapFusion(config, name=f"sd_map_{layer}")(bev, position, tokens, valid)
 
     return fuse

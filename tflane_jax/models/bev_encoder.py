@@ -23,7 +23,6 @@ from typing import Any, Literal
 import flax.linen as nn
 import jax.numpy as jnp
 from flax import struct
-from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from tflane_jax.geometry import BevGrid
@@ -32,7 +31,7 @@ from tflane_jax.layers.bev_attention import SpatialCrossAttention, TemporalSelfA
 from tflane_jax.layers.geometry_kernel import GeometryKernelAttention
 from tflane_jax.layers.transformer import add_and_norm
 from tflane_jax.limits import Count, FractionBelowOne, Rules, splits
-from tflane_jax.models.prior import BevHook
+from tflane_jax.models.prior import BevHook, fuse_priors
 
 
 @dataclass(frozen=True)
@@ -198,7 +197,7 @@ class BevEncoder(nn.Module):
                 visible,
                 shapes,
                 deterministic,
-                None if fuse is None else partial(fuse, i, cell_points(config.grid)),
+                partial(fuse_priors, fuse, i),
             )
         return queries
 
@@ -220,9 +219,12 @@ class BevEncoderLayer(nn.Module):
         visible: Bool[Array, "v q z"],
         shapes: tuple[tuple[int, int], ...],
         deterministic: bool,
-        fuse: Callable[[Float[Array, "q c"], Float[Array, "q c"]], Float[Array, "q c"]] | None = None,
+        fuse: Callable[[Float[Array, "y x c"], Callable[[], Float[Array, "q c"]]], Float[Array, "y x c"]],
     ) -> Float[Array, "q c"]:
-        """Return the queries after the layer; `frames` are the previous and present values of temporal attention."""
+        """Return the queries after the layer.
+
+        `frames` are the previous and present values of temporal attention, `fuse` is `fuse_priors` of this layer.
+        """
         config, grid = self.config, self.config.grid
         init = nn.initializers.xavier_uniform()
 
@@ -246,10 +248,7 @@ class BevEncoderLayer(nn.Module):
                 config.dim, config.heads, config.spatial_points, config.capacity, config.dtype, name="spatial_attention"
             )
         queries = add("spatial", queries, spatial(queries, tokens, shapes, reference, visible))
-        # The barriers keep XLA from fusing across the hook: a prior without data gives bit-identical features.
-        queries = lax.optimization_barrier(queries)
-        if fuse is not None:
-            queries = lax.optimization_barrier(fuse(queries, position))
+        queries = fuse(queries.reshape(grid.rows, grid.columns, -1), lambda: position).reshape(queries.shape)
         x = nn.relu(nn.Dense(config.hidden, kernel_init=init, dtype=config.dtype, name="expand")(queries))
         x = nn.Dropout(config.dropout, name="hidden_dropout")(x, deterministic=deterministic)
         x = nn.Dense(config.dim, kernel_init=init, dtype=config.dtype, name="contract")(x)

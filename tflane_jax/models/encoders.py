@@ -25,7 +25,7 @@ def encode_example(
     memory: BevMemory | None,
     *,
     train: bool,
-    hook: BevHook | None = None,
+    fuse: BevHook | None = None,
 ) -> EncoderOutput:
     """Return the encoder's output for one example.
 
@@ -35,27 +35,27 @@ def encode_example(
         example: one frame.
         memory: BEV features of the previous frame, or None.
         train: dropout is on, and batch norms use batch statistics.
-        hook: how priors change the BEV features of every layer.
+        fuse: how priors change the BEV features of every layer.
 
     Raises:
-        UserError: the example lacks the encoder's input, or the encoder is initialised and leaves the hook out.
+        UserError: the example lacks the encoder's input, or the encoder is initialised and leaves `fuse` out.
     """
     layers: list[int] = []
-    noted = None if hook is None else partial(_noted, hook, layers)
+    noted = None if fuse is None else partial(_noted, fuse, layers)
     output = _encoded(encoder, config, example, memory, train, noted)
-    if hook is not None and encoder.is_initializing() and 0 not in layers:
+    if fuse is not None and encoder.is_initializing() and 0 not in layers:
         raise UserError(
-            f"a prior enters the BEV features, and {type(encoder).__name__} never calls `fuse` of layer 0, which does "
-            "that: call it (docs/architecture.md, An encoder), or choose priors that enter the queries alone "
-            "(task.model.priors)"
+            f"a prior enters the BEV features, and {type(encoder).__name__} never calls `fuse_priors` for layer 0, "
+            "which does that: call it (docs/architecture.md, An encoder), or choose priors that enter the queries "
+            "alone (task.model.priors)"
         )
     return output
 
 
-def _noted(hook: BevHook, layers: list[int], layer: int, *cells: Any) -> Any:
+def _noted(fuse: BevHook, layers: list[int], layer: int, *cells: Any) -> Any:
     """Call the hook, and note the layer."""
     layers.append(layer)
-    return hook(layer, *cells)
+    return fuse(layer, *cells)
 
 
 def _encoded(
@@ -64,16 +64,16 @@ def _encoded(
     example: Example,
     memory: BevMemory | None,
     train: bool,
-    hook: BevHook | None,
+    fuse: BevHook | None,
 ) -> EncoderOutput:
     if isinstance(config, CameraEncoderConfig):
-        return encoder(example, memory, train=train, fuse=hook)
+        return encoder(example, memory, train=train, fuse=fuse)
     if example.bev is None:
         raise UserError(
             "the model reads BEV evidence, and these data have none (bev is None): choose data with evidence, or a "
             "model with cameras"
         )
-    return EncoderOutput(encoder(example.bev, hook))
+    return EncoderOutput(encoder(example.bev, fuse))
 
 
 def start_bev_memory(config: EncoderConfig) -> BevMemory | None:

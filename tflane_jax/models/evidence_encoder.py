@@ -9,7 +9,6 @@ from typing import ClassVar
 import flax.linen as nn
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array, Float, UInt8
 
 from tflane_jax.geometry import BevGrid, PerceptionRange
@@ -18,7 +17,7 @@ from tflane_jax.layers.positions import sine_encoding
 from tflane_jax.layers.precision import Precision, computing, run_layer, run_part
 from tflane_jax.limits import Count, Rules
 from tflane_jax.models.auxiliary import LaneCellHead
-from tflane_jax.models.prior import BevHook
+from tflane_jax.models.prior import BevHook, fuse_priors
 
 # Of channels, in every norm.
 _GROUPS = 8
@@ -105,10 +104,11 @@ class EvidenceEncoder(nn.Module):
         x = nn.relu(_norm("stem_norm")(x))
         fused = 0
         if self.config.levels:
-            x, fused = _fused(fuse, fused, x), 1
+            x, fused = fuse_priors(fuse, fused, x, partial(_positions, x)), 1
             x = run_layer(self, partial(UNet, self.config.levels, name="context"), self.config, x)
         for i, dilation in enumerate(self.config.dilations):
-            x = _fused(fuse, fused + i, run_part(self, partial(_block, i, dilation), self.config, x))
+            x = run_part(self, partial(_block, i, dilation), self.config, x)
+            x = fuse_priors(fuse, fused + i, x, partial(_positions, x))
         if self.config.cells:
             LaneCellHead(name="cells")(x)
         return x
@@ -152,19 +152,9 @@ class _Block(nn.Module):
         return nn.relu(x + _norm("norm")(y))
 
 
-def _fused(fuse: BevHook | None, layer: int, x: Float[Array, "h w d"]) -> Float[Array, "h w d"]:
-    """Return the features with the priors of one layer fused in."""
-    # The barriers keep XLA from fusing across the hook: a prior without data gives bit-identical features.
-    x = lax.optimization_barrier(x)
-    if fuse is None:
-        return x
+def _positions(x: Float[Array, "h w d"]) -> Float[Array, "h*w d"]:
+    """Return the position encoding of the cells of features, with as many channels (a multiple of 4)."""
     places = cell_points(BevGrid(rows=x.shape[0], columns=x.shape[1]))
-    x = fuse(layer, places, x.reshape(-1, x.shape[-1]), _positions(places, x)).reshape(x.shape)
-    return lax.optimization_barrier(x)
-
-
-def _positions(places: np.ndarray, x: Float[Array, "h w d"]) -> Float[Array, "h*w d"]:
-    """Return the position encoding of cells, with the channels of the features (a multiple of 4)."""
     # With 8 bands on 25 x 50 cells, the shortest wavelengths are two and three cells.
     return sine_encoding(jnp.asarray(places, x.dtype), x.shape[-1] // 4, lowest=0.125)
 

@@ -213,9 +213,9 @@ class Host(nn.Module):
             train: see `step`.
         """
         tokens = encode(self.priors.by_name, observations, deterministic=not train)
-        hook = bev_hook(self.priors.by_name, tokens, self.config.spec)
+        fuse = bev_hook(self.priors.by_name, tokens, self.config.spec)
         seen, encoder = self.config.in_host_frame(example), self.config.encoder
-        encoded = encode_example(self.encoder, encoder, seen, memory, train=train, hook=hook)
+        encoded = encode_example(self.encoder, encoder, seen, memory, train=train, fuse=fuse)
         elements = None
         if self.config.elements is not None and encoded.front is not None:
             elements = self.elements(*encoded.front, deterministic=not train)

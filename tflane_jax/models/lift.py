@@ -28,7 +28,7 @@ from tflane_jax.layers.positions import sine_encoding
 from tflane_jax.layers.precision import Precision, run_layer, run_part
 from tflane_jax.limits import Count, FractionBelowOne, Positive, Rules
 from tflane_jax.models.auxiliary import AUXILIARY
-from tflane_jax.models.prior import BevHook
+from tflane_jax.models.prior import BevHook, fuse_priors
 from tflane_jax.scene import CameraViews
 
 
@@ -114,14 +114,9 @@ class LiftEncoder(nn.Module):
         rows, columns = grid.rows * config.fine, grid.columns * config.fine
         cells = cell_numbers(points, BevGrid(grid.range, rows, columns), config.border)
         x = collect(context, jax.nn.softmax(logits, -1), cells, rows * columns).reshape(rows, columns, config.dim)
-        # The barriers keep XLA from fusing across the hook: a prior without data gives bit-identical features.
-        bev = lax.optimization_barrier(run_part(self, partial(_convolved, train), config, x))
-        if fuse is not None:
-            places = cell_points(grid)
-            position = sine_encoding(jnp.asarray(places), config.dim // 4, lowest=0.125)
-            fused = fuse(0, places, bev.reshape(-1, config.dim), position)
-            bev = lax.optimization_barrier(fused.reshape(bev.shape))
-        return bev, logits
+        bev = run_part(self, partial(_convolved, train), config, x)
+        position = partial(sine_encoding, jnp.asarray(cell_points(grid)), config.dim // 4, lowest=0.125)
+        return fuse_priors(fuse, 0, bev, position), logits
 
     def __call__(
         self,

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, Literal, NamedTuple, Protocol, runtime_checkable
 
 import flax.linen as nn
+from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from tflane_jax.geometry import BevGrid, PerceptionRange
@@ -46,10 +47,33 @@ class HostSpec:
     bev_dim: int | None = None
 
 
-BevHook = Callable[[int, Any, Float[Array, "q c"], Float[Array, "q c"]], Float[Array, "q c"]]
-"""Fusion of all priors into the BEV features of an encoder layer: (layer, cell centers (q, 2) in [0, 1], features
-(q, c), position encodings (q, c)) -> features. Centers are the numpy array that `geometry.pillars.cell_points` gives.
-The hook creates its modules when called, so their parameters belong to the layer."""
+BevHook = Callable[[int, tuple[int, int], Float[Array, "q c"], Float[Array, "q c"]], Float[Array, "q c"]]
+"""Fusion of all priors into the BEV features of an encoder layer: (layer, (rows, columns) of the cells, features (q, c)
+and position encodings (q, c) of the cells, row by row) -> features. Encoders call it by `fuse_priors`. The hook creates
+its modules when called, so their parameters belong to the layer."""
+
+
+def fuse_priors(
+    fuse: BevHook | None,
+    layer: int,
+    bev: Float[Array, "h w c"],
+    position: Callable[[], Float[Array, "h*w c"]],
+) -> Float[Array, "h w c"]:
+    """Return the BEV features of an encoder layer with all priors fused in; every encoder calls it in every layer.
+
+    Args:
+        fuse: the hook that the encoder got; None without priors in BEV features.
+        layer: number of the layer, from 0.
+        bev: features of the cells over `HostSpec.bev_range`, row 0 at the smallest y, column 0 at the smallest x.
+        position: returns the position encoding of the cells, row by row; not called without a hook.
+    """
+    # The barriers keep XLA from fusing operations across the hook: priors without data leave features bit-identical.
+    bev = lax.optimization_barrier(bev)
+    if fuse is None:
+        return bev
+    rows, columns, channels = bev.shape
+    fused = fuse(layer, (rows, columns), bev.reshape(-1, channels), position())
+    return lax.optimization_barrier(fused.reshape(bev.shape))
 
 
 class BevCells(NamedTuple):

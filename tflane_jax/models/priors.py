@@ -12,13 +12,13 @@ from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from flax.errors import AssignSubModuleError, CallCompactUnboundModuleError
 from jax import lax
 from jaxtyping import Array, Float
 
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import BevGrid
+from tflane_jax.geometry.pillars import cell_points
 from tflane_jax.models.marker_fusion import MarkerFusionConfig
 from tflane_jax.models.prior import BevCells, BevHook, HostQueries, HostSpec, Prior, PriorConfig
 from tflane_jax.models.sd_map_encoder import SdMapModuleConfig
@@ -113,10 +113,9 @@ def bev_hook(priors: Mapping[str, Prior], tokens: ByPrior, host: HostSpec) -> Be
     if not fusing:
         return None
 
-    def fuse(layer: int, places: np.ndarray, bev: Float[Array, "q c"], position: Float[Array, "q c"]):
-        centers = host.bev_range.denormalise(jnp.asarray(places))
-        columns, rows = (len(np.unique(places[:, axis])) for axis in (0, 1))
-        grid = BevGrid(host.bev_range, rows, columns)
+    def fuse(layer: int, shape: tuple[int, int], bev: Float[Array, "q c"], position: Float[Array, "q c"]):
+        grid = BevGrid(host.bev_range, *shape)
+        centers = host.bev_range.denormalise(jnp.asarray(cell_points(grid)))
         for name, prior in fusing.items():
             fused = prior.into_bev(tokens[name], layer, BevCells(bev, position, centers, grid))
             bev = _alike(f"into_bev of the prior {name}", fused, bev)

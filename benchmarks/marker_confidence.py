@@ -27,7 +27,7 @@ from tflane_jax.markers.simulation import PERFECT
 from tflane_jax.models.marker_fusion import (
     SMALL_MARKER_FUSION,
     MarkerFusionConfig,
-    fusion_gate,
+    as_fused,
     uniform_fusion,
 )
 from tflane_jax.models.prior import HostSpec
@@ -71,8 +71,8 @@ class _Factor:
     def of(self, example: Example) -> tuple[float, float]:
         """Return the largest factor of the frame's lanes, 0 if only remembered ones are used, and that of all lanes."""
         guide, self._bank = self._observe(example, self._bank)
-        gate, valid = fusion_gate(guide, self._config)
-        factors = np.asarray(gate * guide.weight * valid)
+        lanes = as_fused(guide, self._config)
+        factors = np.asarray(lanes.gate * lanes.weight * lanes.valid)
         return float(factors[: self._config.prior.lanes].max()), float(factors.max())
 
 

@@ -21,8 +21,8 @@ from tflane_jax.models.marker_fusion import (
     MarkerFusionConfig,
     MarkerPrior,
     MarkerTokens,
+    as_fused,
     as_written,
-    fusion_gate,
     fusion_mask,
     uniform_fusion,
 )
@@ -187,11 +187,11 @@ def test_memory_bridges_a_gap_up_to_the_length_of_the_bank(params, step):
 
 
 def fused(config, guide, bev, position):
-    module = MarkerFusion(config)
+    module, lanes = MarkerFusion(config), as_fused(guide, config)
     tokens = jnp.asarray(np.random.default_rng(1).normal(size=(len(guide.valid), 8)), jnp.float32)
-    gate, valid = fusion_gate(guide, config)
-    variables = random_params(lambda key: module.init(key, bev, position, tokens, key_mask(valid), gate))
-    return module.apply(variables, bev, position, tokens, key_mask(valid), gate), variables, tokens
+    arguments = bev, position, tokens, key_mask(lanes.valid), lanes.gate
+    variables = random_params(lambda key: module.init(key, *arguments))
+    return module.apply(variables, *arguments), variables, tokens
 
 
 def test_the_gate_is_the_confidence_and_its_variants():
@@ -233,16 +233,16 @@ def test_hard_masking_looks_at_each_marker():
     prior = MarkerPrior(hard, BASELINE.spec)
     guide, bank = prior.observe(seeing(both), prior.start())
     np.testing.assert_allclose(guide.confidence[:4], np.exp([-0.25, -0.25, -3.25, -3.25]), rtol=1e-5)
-    gate, valid = fusion_gate(guide, hard)
-    assert gate == 1.0
+    lanes = as_fused(guide, hard)
+    assert lanes.gate == 1.0
     np.testing.assert_array_equal(np.flatnonzero(guide.valid), [0, 1, 2, 3])
-    np.testing.assert_array_equal(np.flatnonzero(valid), [0, 1])
+    np.testing.assert_array_equal(np.flatnonzero(lanes.valid), [0, 1])
     # One frame later 0.39 is left of 0.78, below the threshold of 0.5.
     gap, _ = prior.observe(seeing(None, has_previous=np.asarray(True)), bank)
     assert gap.valid.any()
     np.testing.assert_allclose(gap.confidence.max(), 0.5 * np.exp(-0.25), rtol=1e-5)
-    assert not fusion_gate(gap, hard)[1].any()
-    assert fusion_gate(gap, replace(hard, hard_threshold=0.3))[1].sum() == 2
+    assert not as_fused(gap, hard).valid.any()
+    assert as_fused(gap, replace(hard, hard_threshold=0.3)).valid.sum() == 2
 
 
 def test_as_written_the_norm_applies_without_markers_too():
@@ -295,7 +295,7 @@ def test_a_zero_initialised_fusion_leaves_the_trained_host_unchanged():
 def test_cells_beyond_the_radius_of_all_lanes_are_unchanged():
     guide, config = lanes_of(seeing(observed())), replace(CONFIG, radius=1.0, norm="query")
     start = guide.points[int(np.argmax(guide.valid)), 0]
-    mask = fusion_mask(guide, guide.valid, jnp.stack([start, start + 500.0]), config)
+    mask = fusion_mask(guide, jnp.stack([start, start + 500.0]), config)
     np.testing.assert_array_equal(mask.any(1), [True, False])
     tokens = jnp.asarray(np.random.default_rng(1).normal(size=(len(guide.valid), 8)), jnp.float32)
     arguments, module = (jnp.ones((2, 8)), jnp.zeros((2, 8)), tokens, mask, guide.gate), MarkerFusion(config)

@@ -22,7 +22,6 @@ from tflane_jax.models.marker_fusion import (
     MarkerPrior,
     as_fused,
     as_written,
-    fusion_gate,
     uniform_fusion,
 )
 from tflane_jax.models.prior import BevCells
@@ -148,7 +147,7 @@ def test_a_marker_at_the_threshold_is_used():
     hard = replace(CONFIG, fusion="hard", hard_threshold=0.5)
     for trust, used in ((0.5, lanes.valid), (0.49, jnp.zeros_like(lanes.valid))):
         equal = lanes.replace(confidence=jnp.where(lanes.valid, trust, 0.0))
-        np.testing.assert_array_equal(fusion_gate(equal, hard)[1], used)
+        np.testing.assert_array_equal(as_fused(equal, hard).valid, used)
 
 
 @pytest.mark.parametrize("attend", ["points", "lines"])

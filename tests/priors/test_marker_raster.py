@@ -15,7 +15,7 @@ from tflane_jax.priors.marker_memory import MarkerGuidance
 from tflane_jax.priors.marker_raster import CHANNELS, rasterise_markers
 
 GRID = BevGrid(PerceptionRange((-20.0, 20.0), (-10.0, 10.0)), rows=10, columns=20)
-rasterise = jax.jit(rasterise_markers, static_argnums=(2, 3))
+rasterise = jax.jit(rasterise_markers, static_argnums=(1, 2))
 
 
 def guidance(seed, lanes=5, points=4, padding=2, gate=0.8):
@@ -57,7 +57,7 @@ def loop_raster(lanes, grid, between):
 def test_raster_equals_loops(seed, between):
     lanes = guidance(seed)
     expected = loop_raster(lanes, GRID, between)
-    raster = rasterise(lanes, lanes.valid, GRID, between)
+    raster = rasterise(lanes, GRID, between)
     assert (expected[:, 0] > 0).sum() > 5
     np.testing.assert_allclose(raster.features, expected, atol=2e-4)
     np.testing.assert_array_equal(raster.trust, raster.features[:, 1])
@@ -66,7 +66,7 @@ def test_raster_equals_loops(seed, between):
 def test_a_doubled_point_has_no_direction_and_gives_no_nan():
     lanes = guidance(3)
     lanes = replace(lanes, points=np.repeat(lanes.points[:, :1], 4, 1))
-    raster = rasterise(lanes, lanes.valid, GRID, 2)
+    raster = rasterise(lanes, GRID, 2)
     assert np.isfinite(raster.features).all()
     np.testing.assert_array_equal(raster.features[:, 2:4], 0.0)
 
@@ -75,7 +75,7 @@ def test_a_doubled_point_has_no_direction_and_gives_no_nan():
 def test_order_of_lanes_changes_nothing_and_distrust_is_no_trust(gate):
     lanes, order = guidance(4, gate=gate), np.random.default_rng(0).permutation(5)
     permuted = replace(lanes, points=lanes.points[order], weight=lanes.weight[order], valid=lanes.valid[order])
-    a, b = (rasterise(each, each.valid, GRID, 3) for each in (lanes, permuted))
+    a, b = (rasterise(each, GRID, 3) for each in (lanes, permuted))
     np.testing.assert_allclose(a.features, b.features, atol=1e-6)
     assert (np.asarray(a.trust).max() > 0) == (gate > 0)
     assert np.isfinite(a.features).all()
@@ -84,7 +84,7 @@ def test_order_of_lanes_changes_nothing_and_distrust_is_no_trust(gate):
 @pytest.mark.parametrize("lanes", [0, 1])
 def test_sizes_0_and_1(lanes):
     none = jax.tree.map(lambda leaf: leaf[:lanes] if np.ndim(leaf) else leaf, guidance(5))
-    raster = rasterise(none, none.valid, GRID, 3)
+    raster = rasterise(none, GRID, 3)
     assert raster.features.shape == (200, CHANNELS)
     assert (np.asarray(raster.features).any()) == bool(lanes)
 
@@ -92,5 +92,5 @@ def test_sizes_0_and_1(lanes):
 def test_lanes_shifted_by_whole_cells_move_the_raster():
     lanes = guidance(6)
     moved = replace(lanes, points=lanes.points + jnp.asarray([[[4.0, -2.0]]]))
-    a, b = (np.asarray(rasterise(each, each.valid, GRID, 3).features).reshape(10, 20, -1) for each in (lanes, moved))
+    a, b = (np.asarray(rasterise(each, GRID, 3).features).reshape(10, 20, -1) for each in (lanes, moved))
     np.testing.assert_allclose(b[:-1, 2:], a[1:, :-2], atol=2e-4)

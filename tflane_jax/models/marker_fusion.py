@@ -119,15 +119,11 @@ class FusedMarkers(NamedTuple):
 
     Attributes:
         tokens: (N, D) one token per lane.
-        lanes: the lanes themselves.
-        gate: () c of Eq. (3).
-        valid: (N,) lanes that may be attended to.
+        lanes: the lanes themselves; `gate` and `valid` are those of the variant, see `as_fused`.
     """
 
     tokens: Float[Array, "n d"]
     lanes: MarkerGuidance
-    gate: Float[Array, ""]
-    valid: Bool[Array, " n"]
 
 
 class MarkerPrior(Prior):
@@ -165,22 +161,20 @@ class MarkerPrior(Prior):
         return lanes, bank
 
     def encode(self, observation: MarkerGuidance, *, deterministic: bool) -> FusedMarkers:
-        """Return the lanes' tokens with the gate and mask of the variant (Table II)."""
-        gate, valid = fusion_gate(observation, self.config)
-        tokens = self.marker_tokens(replace(observation, valid=valid), deterministic=deterministic)
-        return FusedMarkers(tokens, observation, gate, valid)
+        """Return the lanes that the variant attends to (Table II), and their tokens."""
+        lanes = as_fused(observation, self.config)
+        return FusedMarkers(self.marker_tokens(lanes, deterministic=deterministic), lanes)
 
     def into_bev(self, tokens: FusedMarkers, layer: int, cells: BevCells) -> Float[Array, "q c"]:
         """Return Eq. (3), after the lanes were written into their cells if `MarkerFusionConfig.bev` is set."""
-        features, raster_config = cells.features, self.config.bev
+        features, lanes, raster_config = cells.features, tokens.lanes, self.config.bev
         if raster_config is not None and raster_config.enters(layer):
-            lanes = replace(tokens.lanes, gate=tokens.gate)
-            raster = rasterise_markers(lanes, tokens.valid, cells.grid, raster_config.between)
+            raster = rasterise_markers(lanes, cells.grid, raster_config.between)
             fuse = RasterFusion(raster_config.hidden, name=f"marker_cells_{layer}")
             features = fuse(features, raster.features, raster.trust > 0.0, raster.trust)
         fusion = MarkerFusion(self.config, name=f"markers_{layer}")
-        mask = fusion_mask(tokens.lanes, tokens.valid, cells.centers, self.config)
-        return fusion(features, cells.position, tokens.tokens, mask, tokens.gate)
+        mask = fusion_mask(lanes, cells.centers, self.config)
+        return fusion(features, cells.position, tokens.tokens, mask, lanes.gate)
 
 
 class MarkerTokens(nn.Module):
@@ -254,7 +248,7 @@ class MarkerFusion(nn.Module):
             bev, position: features of the cells and their position encoding.
             tokens: of the marker lanes.
             mask: which cell may attend to which token.
-            gate: c of Eq. (3), as from `fusion_gate`.
+            gate: c of Eq. (3), see `as_fused`.
         """
         return run_part(self, MarkerFusion._fuse, self.config, bev, position, tokens, mask, gate)
 
@@ -266,27 +260,21 @@ class MarkerFusion(nn.Module):
         return fused if config.norm == "written" else jnp.where(mask.any(), fused, bev)
 
 
-def fusion_gate(lanes: MarkerGuidance, config: MarkerFusionConfig) -> tuple[Float[Array, ""], Bool[Array, " n"]]:
-    """Return c of Eq. (3) and which tokens may be attended to, for the variants of Table II."""
-    if config.fusion == "gated":
-        return lanes.gate, lanes.valid
-    one = jnp.ones_like(lanes.gate)
-    if config.fusion == "uniform":
-        return one, lanes.valid
-    # Each marker by its own confidence: the gate is that of the most trusted one.
-    return one, lanes.valid & (lanes.confidence >= config.hard_threshold)
-
-
 def as_fused(lanes: MarkerGuidance, config: MarkerFusionConfig) -> MarkerGuidance:
     """Return the lanes that a variant of Table II attends to, with its c of Eq. (3): 0 without any."""
-    gate, valid = fusion_gate(lanes, config)
+    gate, valid = lanes.gate, lanes.valid
+    if config.fusion == "hard":
+        # Each marker by its own confidence: the gate is that of the most trusted one.
+        valid = valid & (lanes.confidence >= config.hard_threshold)
+    if config.fusion != "gated":
+        gate = jnp.ones_like(gate)
     return replace(lanes, gate=jnp.where(valid.any(), gate, 0.0), valid=valid)
 
 
 def fusion_mask(
-    lanes: MarkerGuidance, valid: Bool[Array, " n"], cells: Float[ArrayLike, "q 2"], config: MarkerFusionConfig
+    lanes: MarkerGuidance, cells: Float[ArrayLike, "q 2"], config: MarkerFusionConfig
 ) -> Bool[Array, "#q n"]:
-    """Return which BEV cell, centred at (x, y) in metres, may attend to which token."""
+    """Return which BEV cell, centred at (x, y) in metres, may attend to which of the lanes of `as_fused`."""
     if config.radius is None:
-        return key_mask(valid)
-    return radius_mask(jnp.asarray(cells), lanes.points, valid, config.radius)
+        return key_mask(lanes.valid)
+    return radius_mask(jnp.asarray(cells), lanes.points, lanes.valid, config.radius)

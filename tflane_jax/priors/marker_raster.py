@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from tflane_jax.geometry import BevGrid
 from tflane_jax.priors.bev_cells import cells_of
@@ -37,15 +37,15 @@ class MarkerRaster:
     trust: Float[Array, " q"]
 
 
-def rasterise_markers(lanes: MarkerGuidance, valid: Bool[Array, " n"], grid: BevGrid, between: int) -> MarkerRaster:
+def rasterise_markers(lanes: MarkerGuidance, grid: BevGrid, between: int) -> MarkerRaster:
     """Return the raster of the lanes that enter Eq. (3); points outside the grid are left out.
 
     Args:
-        lanes: after memory, `gate` that of the variant (Table II).
-        valid: (N,) lanes that may be attended to.
+        lanes: after memory, `gate` and `valid` those of the variant (Table II).
         grid: the cells.
         between: points interpolated between successive points of a lane, so that a lane leaves no gap.
     """
+    valid = lanes.valid
     points = jnp.where(valid[:, None, None], lanes.points, 0.0)
     line, direction = _with_points_between(points, between)  # metres
     count = line.shape[1]

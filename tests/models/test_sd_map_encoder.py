@@ -22,7 +22,7 @@ from tflane_jax.layers.polyline_encoder import (
 from tflane_jax.models.bevformer import BevFormer, BevFormerConfig
 from tflane_jax.models.evidence_encoder import EvidenceEncoder, EvidenceEncoderConfig
 from tflane_jax.models.priors import PriorsConfig
-from tflane_jax.models.sd_map_encoder import SdMapEncoder, SdMapFusion, SdMapModuleConfig
+from tflane_jax.models.sd_map_encoder import SdMapEncoder, SdMapFusion, SdMapModuleConfig, sd_map_mask
 from tflane_jax.scene import SdMap
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 
@@ -133,6 +133,27 @@ def test_a_map_without_lines_changes_no_feature(absent, lines):
         total = np.asarray(bev) + inner["attention"]["output"]["bias"]
         unit = (total - total.mean(-1, keepdims=True)) / np.sqrt(total.var(-1, keepdims=True) + 1e-5)
         np.testing.assert_allclose(out, unit * inner["norm"]["scale"] + inner["norm"]["bias"], atol=1e-5)
+
+
+@pytest.mark.parametrize("absent", ["nothing", "reference"])
+@pytest.mark.parametrize("norm", ["sum", "query"])
+def test_a_map_out_of_sight_of_all_cells_is_no_map(norm, absent):
+    """Regression: with a radius and the norm around the sum, a map far from all cells normalised all features."""
+    rng, config = np.random.default_rng(1), replace(MODULE, norm=norm, radius=5.0, absent=absent)
+    bev, position, tokens = (jnp.asarray(rng.normal(size=(n, 8)), jnp.float32) for n in (5, 5, 3))
+    cells, fusion = jnp.asarray(rng.uniform(-20, 20, (5, 2)), jnp.float32), SdMapFusion(config)
+    near, far = small_map(np.ones(3, bool)), small_map(np.ones(3, bool))
+    far.points[:] += 500.0
+    params = random_params(fusion.init, bev, position, tokens, jnp.ones(3, bool))
+
+    @jax.jit
+    def run(sd_map):
+        return fusion.apply(params, bev, position, tokens, sd_map.valid, sd_map_mask(sd_map, cells, config))
+
+    gone = run(small_map(np.zeros(3, bool)))
+    np.testing.assert_array_equal(run(far), gone)
+    assert np.abs(run(near) - gone).max() > 1e-3
+    assert np.array_equal(gone, bev) == (absent == "nothing")
 
 
 class Fused(nn.Module):

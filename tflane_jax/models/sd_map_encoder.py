@@ -31,8 +31,9 @@ class SdMapModuleConfig(TokenFusionConfig):
         prior: coordinates and labels.
         lines: encoder of polylines.
         heads, width, norm, radius, precision, remat: see `TokenFusionConfig`; SMERF's are the defaults.
-        absent: if no line is valid, "nothing" leaves the BEV features exactly as they are; "reference" adds the bias of
-            the attention's output and normalises, as the published code does for an empty map in a batch.
+        absent: if no cell may attend to a line, because none is valid or, with a radius, near a cell, "nothing" leaves
+            the BEV features exactly as they are; "reference" adds the bias of the attention's output and normalises, as
+            the published code, which has no radius, does for an empty map in a batch.
     """
 
     prior: SdMapPriorConfig = SdMapPriorConfig()
@@ -142,7 +143,7 @@ class SdMapFusion(nn.Module):
         valid: Bool[Array, " r"],
         mask: Bool[Array, "q r"] | None = None,
     ) -> Float[Array, "q c"]:
-        """Return the BEV features after the fusion; without valid lines, see `SdMapModuleConfig.absent`.
+        """Return the BEV features after the fusion; if no cell attends to a line, see `SdMapModuleConfig.absent`.
 
         Args:
             bev, position: features of the cells and their position encoding.
@@ -153,7 +154,8 @@ class SdMapFusion(nn.Module):
 
     def _fuse(self, bev, position, tokens, valid, mask) -> Float[Array, "q c"]:
         """Return the BEV features; called by the compact method."""
-        config, present = self.config, valid.any()
+        config, mask = self.config, key_mask(valid) if mask is None else mask
+        present = mask.any()
 
         def change(found):
             if config.absent == "nothing":
@@ -161,7 +163,6 @@ class SdMapFusion(nn.Module):
             # Attention without keys: published code has 0 before the output projection, this one after it.
             return jnp.where(present, found, self.variables["params"]["attention"]["output"]["bias"][None])
 
-        mask = key_mask(valid) if mask is None else mask
         fused = attend_to_tokens(config, bev, position, tokens, mask, change)
         return fused if config.absent == "reference" else jnp.where(present, fused, bev)
 

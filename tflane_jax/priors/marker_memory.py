@@ -170,8 +170,8 @@ def remember(
     retrieve = jnp.asarray(reads_bank(observed, config))
     strongest = decayed.max(initial=0.0)
     scale = jnp.where(strongest > 0, strongest, 1.0) if config.gate == "once" else 1.0
-    weight = jnp.where(retrieve, _power(decayed / scale, config.exponent), 0.0)  # Eq. (4)
-    weight = weight.at[0].set(jnp.where(retrieve, weight[0], alone.weight))
+    # Eq. (4), or the frame alone, of which only slot 0 is used.
+    weight = jnp.where(retrieve, _power(decayed / scale, config.exponent), alone.weight[None])
     from_bank = jnp.where(strongest > 0, 1.0, 0.0) if config.gate == "one" else strongest
     used = bank.valid & (retrieve | (age == 0))[:, None]
     gate = jnp.where(retrieve, from_bank, alone.gate)

@@ -15,7 +15,7 @@ from tflane_jax.plots import new_figure, save_figure
 from tflane_jax.plots.bev import draw_ego, draw_found, draw_lanes, draw_scene, prepare
 from tflane_jax.plots.gallery import label_edges, panel_size
 from tflane_jax.plots.legends import hidden_entries, prediction_entries, truth_entry, visibility_entries
-from tflane_jax.plots.marker_drive import OUTCOMES, draw_boards, draw_guidance, trust_colours
+from tflane_jax.plots.marker_drive import OUTCOMES, draw_boards, draw_guidance, lane_colours
 from tflane_jax.plots.style import ROAD
 from tflane_jax.priors.marker_memory import MarkerGuidance
 from tflane_jax.scene import CameraViews, Example, Prediction
@@ -148,7 +148,7 @@ def _small(outcome: Any) -> dict[str, Any]:
 def _entries() -> list[Any]:
     from matplotlib.lines import Line2D
 
-    doubted, half, trusted = trust_colours(np.array([0.0, 0.5, 1.0]))
+    doubted, half, trusted = lane_colours(np.array([0.0, 0.5, 1.0]))
     return [
         Line2D([], [], color=OUTCOMES["used"], lw=0, marker="s", ms=5, label="board (read before)"),
         *(

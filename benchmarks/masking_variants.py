@@ -31,7 +31,7 @@ from tflane_jax.models.traffic_masks import spatial_mask
 from tflane_jax.plots.figure import new_figure, save_figure
 from tflane_jax.plots.style import curve_style
 from tflane_jax.plots.tables import written_to
-from tflane_jax.priors.traffic_flow import TrafficFlowTokens
+from tflane_jax.priors.traffic_flow import SelectedTracks
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 
 PAPER = "LT/LL"
@@ -51,7 +51,7 @@ def variants() -> dict[str, TrafficFlowConfig]:
     return found
 
 
-def make_inputs(queries: int, prior: TrafficFlowConfig) -> tuple[HostQueries, TrafficFlowTokens]:
+def make_inputs(queries: int, prior: TrafficFlowConfig) -> tuple[HostQueries, SelectedTracks]:
     """Return seeded random queries and tracks of a batch; about two thirds of the instances are valid."""
     rng = np.random.default_rng(queries)
     instances, frames = prior.prior.max_instances, prior.prior.frames
@@ -59,7 +59,7 @@ def make_inputs(queries: int, prior: TrafficFlowConfig) -> tuple[HostQueries, Tr
     asked = HostQueries(features, position, jnp.asarray(rng.random((BATCH, queries, POINTS, 3), np.float32)))
     valid = rng.random((BATCH, instances)) < 2 / 3
     heading = rng.standard_normal((BATCH, instances, frames, 2), np.float32)
-    tracks = TrafficFlowTokens(
+    tracks = SelectedTracks(
         position=jnp.asarray(rng.random((BATCH, instances, frames, 3), np.float32)),
         heading=jnp.asarray(heading / np.linalg.norm(heading, axis=-1, keepdims=True)),
         size=jnp.asarray(rng.random((BATCH, instances, 3), np.float32)),
@@ -72,12 +72,12 @@ def make_inputs(queries: int, prior: TrafficFlowConfig) -> tuple[HostQueries, Tr
     return asked, tracks
 
 
-def program(config: TrafficFlowConfig, queries: HostQueries, tracks: TrafficFlowTokens) -> tuple[Any, Any]:
+def program(config: TrafficFlowConfig, queries: HostQueries, tracks: SelectedTracks) -> tuple[Any, Any]:
     """Return the gradient of the module's squared output, and its parameters."""
     spec, module = HostSpec(DIM, RANGE, RANGE), config.module
     temporal, spatial = TemporalEncoder(module, DIM, config.prior.coordinates), SpatialEncoder(module, DIM)
 
-    def one(params, asked: HostQueries, flow: TrafficFlowTokens):
+    def one(params, asked: HostQueries, flow: SelectedTracks):
         tokens = temporal.apply(params["temporal"], flow)
         mask = spatial_mask(module.masking, asked, flow, config.prior.coordinates, spec.bev_range)
         return jnp.asarray(spatial.apply(params["spatial"], asked.features, asked.position, tokens, mask))

@@ -15,7 +15,7 @@ from tests.parameters import random_params
 from tests.slow import with_slow
 from tflane_jax.geometry import BevGrid
 from tflane_jax.models.graph_encoders import GcnEncoderConfig, HanEncoderConfig
-from tflane_jax.models.marker_fusion import MarkerFusion, MarkerTokens
+from tflane_jax.models.marker_fusion import MarkerEncoder, MarkerFusion
 from tflane_jax.models.sd_map_encoder import SdMapEncoder, SdMapFusion, SdMapModuleConfig
 from tflane_jax.priors.marker_memory import MarkerGuidance
 from tflane_jax.scene import SdMap
@@ -39,8 +39,8 @@ IMAGE, SHOWN = RNG.normal(size=(HEIGHT, WIDTH, 3)).astype(np.float32), np.ones((
 
 # Module of the settings, what it reads, and how many parts are recomputed.
 PARTS = {
-    "marker tokens": (lambda **s: MarkerTokens(replace(CONFIG, connectivity=True, **s), RANGE), (LANES,), 1),
-    "markers, MLP": (lambda **s: MarkerTokens(replace(CONFIG, encoding="mlp", **s), RANGE), (LANES,), 0),
+    "marker tokens": (lambda **s: MarkerEncoder(replace(CONFIG, connectivity=True, **s), RANGE), (LANES,), 1),
+    "markers, MLP": (lambda **s: MarkerEncoder(replace(CONFIG, encoding="mlp", **s), RANGE), (LANES,), 0),
     "marker fusion": (lambda **s: MarkerFusion(replace(CONFIG, **s)), (BEV, POSITION, TOKENS, MASK, LANES.gate), 1),
     "map tokens": (lambda **s: SdMapEncoder(replace(SD_MAP, **s), RANGE), (MAP,), 1),
     "map fusion": (lambda **s: SdMapFusion(replace(SD_MAP, **s)), (BEV, POSITION, TOKENS, VALID), 1),

@@ -17,10 +17,10 @@ from tflane_jax.layers.masks import key_mask
 from tflane_jax.layers.polyline_encoder import PolylineEncoderConfig
 from tflane_jax.models.marker_fusion import (
     LaneNeighbours,
+    MarkerEncoder,
     MarkerFusion,
     MarkerFusionConfig,
     MarkerPrior,
-    MarkerTokens,
     as_fused,
     as_written,
     fusion_mask,
@@ -307,7 +307,7 @@ def test_cells_beyond_the_radius_of_all_lanes_are_unchanged():
 @pytest.mark.parametrize("encoding", with_slow(["sine", "transformer", "mlp"], quick=["sine"]))
 @pytest.mark.parametrize("connectivity", [False, True])
 def test_tokens_are_scaled_and_belong_to_their_lane(encoding, connectivity):
-    module = MarkerTokens(replace(CONFIG, encoding=encoding, connectivity=connectivity), BASELINE.spec.bev_range)
+    module = MarkerEncoder(replace(CONFIG, encoding=encoding, connectivity=connectivity), BASELINE.spec.bev_range)
     guide = lanes_of(seeing(observed()))
     variables = random_params(module.init, guide)
     tokens = np.asarray(module.apply(variables, guide))
@@ -325,7 +325,7 @@ def test_tokens_are_scaled_and_belong_to_their_lane(encoding, connectivity):
 @pytest.mark.parametrize("encoding", ["transformer", "mlp"])
 def test_only_the_transformer_models_interactions_of_points(encoding):
     """Table IV: without interactions, moving two points of a line changes the sum of what moving each changes."""
-    module = MarkerTokens(replace(CONFIG, encoding=encoding), BASELINE.spec.bev_range)
+    module = MarkerEncoder(replace(CONFIG, encoding=encoding), BASELINE.spec.bev_range)
     guide = lanes_of(seeing(observed()))
     variables = random_params(module.init, guide)
     first, last = (jnp.zeros_like(guide.points).at[0, i].set(3.0) for i in (0, -1))

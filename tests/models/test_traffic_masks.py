@@ -23,7 +23,7 @@ from tflane_jax.models.traffic_flow_module import (
     TrafficFlowModuleConfig,
 )
 from tflane_jax.models.traffic_masks import TrafficMaskConfig, spatial_mask, temporal_mask
-from tflane_jax.priors.traffic_flow import TrafficFlowTokens
+from tflane_jax.priors.traffic_flow import SelectedTracks
 
 DIM, RANGE = 8, PerceptionRange((-50.0, 50.0), (-25.0, 25.0), (-3.0, 3.0))
 LOCAL = {
@@ -46,7 +46,7 @@ def tracks(coordinates="normalised"):
     valid = np.array([True, True, False])
     frame_valid = np.broadcast_to(valid[:, None], (3, 3)).copy()
     frame_valid[0, 0] = False
-    return TrafficFlowTokens(
+    return SelectedTracks(
         position=jnp.asarray(np.where(frame_valid[..., None], position, 0.0)),
         heading=jnp.asarray(np.where(frame_valid[..., None], [1.0, 0.0], 0.0)),
         size=jnp.ones((3, 3)),

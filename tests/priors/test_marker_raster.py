@@ -46,9 +46,9 @@ def loop_raster(lanes, grid, between):
                 found[int(v) * grid.columns + int(u)].append((weight * float(lanes.gate), row))
     features = np.zeros((grid.rows * grid.columns, CHANNELS))
     for cell, hits in found.items():
-        trust = np.array([hit[0] for hit in hits])
-        means = np.average([hit[1] for hit in hits], 0, weights=np.maximum(trust, 1e-6))
-        features[cell] = [math.log1p(len(hits) / (between + 1)), trust.max(), *means]
+        factor = np.array([hit[0] for hit in hits])
+        means = np.average([hit[1] for hit in hits], 0, weights=np.maximum(factor, 1e-6))
+        features[cell] = [math.log1p(len(hits) / (between + 1)), factor.max(), *means]
     return features
 
 
@@ -60,7 +60,7 @@ def test_raster_equals_loops(seed, between):
     raster = rasterise(lanes, GRID, between)
     assert (expected[:, 0] > 0).sum() > 5
     np.testing.assert_allclose(raster.features, expected, atol=2e-4)
-    np.testing.assert_array_equal(raster.trust, raster.features[:, 1])
+    np.testing.assert_array_equal(raster.factor, raster.features[:, 1])
 
 
 def test_a_doubled_point_has_no_direction_and_gives_no_nan():
@@ -72,12 +72,12 @@ def test_a_doubled_point_has_no_direction_and_gives_no_nan():
 
 
 @pytest.mark.parametrize("gate", [0.0, 1.0])
-def test_order_of_lanes_changes_nothing_and_distrust_is_no_trust(gate):
+def test_order_of_lanes_changes_nothing_and_a_closed_gate_leaves_no_factor(gate):
     lanes, order = guidance(4, gate=gate), np.random.default_rng(0).permutation(5)
     permuted = replace(lanes, points=lanes.points[order], weight=lanes.weight[order], valid=lanes.valid[order])
     a, b = (rasterise(each, GRID, 3) for each in (lanes, permuted))
     np.testing.assert_allclose(a.features, b.features, atol=1e-6)
-    assert (np.asarray(a.trust).max() > 0) == (gate > 0)
+    assert (np.asarray(a.factor).max() > 0) == (gate > 0)
     assert np.isfinite(a.features).all()
 
 

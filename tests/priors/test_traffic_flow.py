@@ -71,27 +71,27 @@ def loop_selection(flow: TrafficFlow, config: TrafficFlowPriorConfig) -> list[in
 def test_selection_matches_plain_loops(seed, tolerance):
     config = dataclasses.replace(CONFIG, min_valid_frames=tolerance)
     flow = make_flow(seed)
-    tokens = select_traffic_flow(flow, config)
+    tracks = select_traffic_flow(flow, config)
     expected = loop_selection(flow, config)
-    assert tokens.index[tokens.valid].tolist() == expected
-    assert tokens.valid.tolist() == [i < len(expected) for i in range(6)]
+    assert tracks.index[tracks.valid].tolist() == expected
+    assert tracks.valid.tolist() == [i < len(expected) for i in range(6)]
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_every_instance_keeps_its_own_size_category_heading_and_weight(seed):
     flow = make_flow(seed)
-    tokens = select_traffic_flow(flow, dataclasses.replace(CONFIG, coordinates="metres"))
-    assert tokens.valid.any()
-    for slot in np.flatnonzero(tokens.valid):
-        k, there = tokens.index[slot], tokens.frame_valid[slot]
-        np.testing.assert_array_equal(tokens.size[slot], flow.size[k])
-        assert tokens.category[slot] == flow.category[k]
-        np.testing.assert_array_equal(tokens.position[slot][there], flow.position[k][there])
+    tracks = select_traffic_flow(flow, dataclasses.replace(CONFIG, coordinates="metres"))
+    assert tracks.valid.any()
+    for slot in np.flatnonzero(tracks.valid):
+        k, there = tracks.index[slot], tracks.frame_valid[slot]
+        np.testing.assert_array_equal(tracks.size[slot], flow.size[k])
+        assert tracks.category[slot] == flow.category[k]
+        np.testing.assert_array_equal(tracks.position[slot][there], flow.position[k][there])
         yaw = flow.yaw[k][there]
-        np.testing.assert_allclose(tokens.heading[slot][there], np.stack([np.cos(yaw), np.sin(yaw)], -1), atol=1e-6)
-        np.testing.assert_array_equal(tokens.heading[slot][~there], 0.0)
+        np.testing.assert_allclose(tracks.heading[slot][there], np.stack([np.cos(yaw), np.sin(yaw)], -1), atol=1e-6)
+        np.testing.assert_array_equal(tracks.heading[slot][~there], 0.0)
         x, y = flow.position[k, np.flatnonzero(there)[-1], :2]
-        assert tokens.weight[slot] == pytest.approx(weight_at(x, y, CONFIG), rel=1e-5)
+        assert tracks.weight[slot] == pytest.approx(weight_at(x, y, CONFIG), rel=1e-5)
 
 
 @pytest.mark.parametrize("coordinates", ["normalised", "metres"])
@@ -127,18 +127,18 @@ def test_normalised_coordinates_span_the_bev():
 @pytest.mark.parametrize(("instances", "capacity", "frames"), [(0, 4, 20), (1, 1, 20), (3, 4, 22), (0, 0, 20)])
 def test_sizes(instances, capacity, frames):
     flow = make_flow(6, instances, frames, capacity)
-    tokens = select_traffic_flow(flow, dataclasses.replace(CONFIG, min_valid_frames=1))
-    assert tokens.frame_valid.shape == (6, 20)
-    assert tokens.valid.sum() <= instances
-    assert not tokens.frame_valid[~tokens.valid].any()
-    assert not tokens.position[~tokens.valid].any()
+    tracks = select_traffic_flow(flow, dataclasses.replace(CONFIG, min_valid_frames=1))
+    assert tracks.frame_valid.shape == (6, 20)
+    assert tracks.valid.sum() <= instances
+    assert not tracks.frame_valid[~tracks.valid].any()
+    assert not tracks.position[~tracks.valid].any()
 
 
 def test_no_top_instances_is_no_traffic():
-    tokens = select_traffic_flow(make_flow(7), dataclasses.replace(CONFIG, top_instances=0))
-    assert not tokens.valid.any()
-    assert not tokens.frame_valid.any()
-    assert not tokens.size.any()
+    tracks = select_traffic_flow(make_flow(7), dataclasses.replace(CONFIG, top_instances=0))
+    assert not tracks.valid.any()
+    assert not tracks.frame_valid.any()
+    assert not tracks.size.any()
 
 
 def test_too_few_frames_is_an_error():

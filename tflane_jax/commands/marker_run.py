@@ -253,18 +253,18 @@ def _confidence(step: DriveStep) -> dict[int, float]:
     """Return the confidence of each id that gives lanes."""
     markers, outcomes = step.reading.observed.markers, step.reading.observed.outcomes
     rows = {int(markers.marker_id[k]): float(step.confidence[k]) for k in np.flatnonzero(markers.valid)}
-    return {number: trust for number, trust in rows.items() if outcomes[number] == "used"}
+    return {number: confidence for number, confidence in rows.items() if outcomes[number] == "used"}
 
 
 def _record(step: DriveStep, views: CameraViews, names: Sequence[str], threshold: float) -> dict[str, Any]:
     """Return a frame as plain values."""
     detected, markers, guidance = step.reading.detected, step.reading.observed.markers, step.guidance
     residual = {int(markers.marker_id[k]): float(markers.residual[k]) for k in np.flatnonzero(markers.valid)}
-    trust = _confidence(step)
+    confidence = _confidence(step)
     boards = []
     for k in np.flatnonzero(detected.valid).tolist():
         number, position = int(detected.marker_id[k]), detected.pose[k, :3, 3].astype(float)
-        prior = {"residual": residual[number], "confidence": trust[number]} if number in trust else {}
+        prior = {"residual": residual[number], "confidence": confidence[number]} if number in confidence else {}
         boards.append(
             {
                 "id": number,

@@ -23,7 +23,7 @@ from tflane_jax.scene import CenterlinePrediction, Example, Prediction
 class MarkerLanes:
     """A predictor (`evaluation.predict.Predictor`) that answers with the lanes of the marker prior of a host.
 
-    A lane's score is its trust: c of Eq. (3) times its weight of Eq. (4).
+    A lane's score is the factor of its token in Eq. (3): c times its weight of Eq. (4).
 
     Attributes:
         model: a host with a marker prior.

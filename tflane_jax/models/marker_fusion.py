@@ -114,7 +114,7 @@ def as_written(config: MarkerFusionConfig) -> MarkerFusionConfig:
     return replace(config, norm="written", width=None, radius=None, query_position=False)
 
 
-class FusedMarkers(NamedTuple):
+class EncodedMarkers(NamedTuple):
     """Prior tokens of a frame's markers, as every BEV layer reads them.
 
     Attributes:
@@ -133,7 +133,7 @@ class MarkerPrior(Prior):
 
     def __init__(self, config: MarkerFusionConfig, host: HostSpec):
         self.config = config
-        self.marker_tokens = MarkerTokens(config, host.bev_range)
+        self.marker_tokens = MarkerEncoder(config, host.bev_range)
 
     def modules(self) -> dict[str, nn.Module]:
         """Return the lane encoder."""
@@ -160,24 +160,24 @@ class MarkerPrior(Prior):
         )
         return lanes, bank
 
-    def encode(self, observation: MarkerGuidance, *, deterministic: bool) -> FusedMarkers:
+    def encode(self, observation: MarkerGuidance, *, deterministic: bool) -> EncodedMarkers:
         """Return the lanes that the variant attends to (Table II), and their tokens."""
         lanes = as_fused(observation, self.config)
-        return FusedMarkers(self.marker_tokens(lanes, deterministic=deterministic), lanes)
+        return EncodedMarkers(self.marker_tokens(lanes, deterministic=deterministic), lanes)
 
-    def into_bev(self, tokens: FusedMarkers, layer: int, cells: BevCells) -> Float[Array, "q c"]:
+    def into_bev(self, tokens: EncodedMarkers, layer: int, cells: BevCells) -> Float[Array, "q c"]:
         """Return Eq. (3), after the lanes were written into their cells if `MarkerFusionConfig.bev` is set."""
         features, lanes, raster_config = cells.features, tokens.lanes, self.config.bev
         if raster_config is not None and raster_config.enters(layer):
             raster = rasterise_markers(lanes, cells.grid, raster_config.between)
             fuse = RasterFusion(raster_config.hidden, name=f"marker_cells_{layer}")
-            features = fuse(features, raster.features, raster.trust > 0.0, raster.trust)
+            features = fuse(features, raster.features, raster.factor > 0.0, raster.factor)
         fusion = MarkerFusion(self.config, name=f"markers_{layer}")
         mask = fusion_mask(lanes, cells.centers, self.config)
         return fusion(features, cells.position, tokens.tokens, mask, lanes.gate)
 
 
-class MarkerTokens(nn.Module):
+class MarkerEncoder(nn.Module):
     """Encodes polylines to one token each (III-A), with messages between neighbours if `connectivity` is set.
 
     Attributes:

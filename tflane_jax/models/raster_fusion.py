@@ -56,7 +56,7 @@ class MarkerRasterConfig(RasterConfig):
 
 
 class RasterFusion(nn.Module):
-    """F + trust * MLP(raster), cell by cell.
+    """F + factor * MLP(raster), cell by cell.
 
     The last layer starts at zero, so that training can continue from a host without the prior.
 
@@ -72,7 +72,7 @@ class RasterFusion(nn.Module):
         bev: Float[Array, "q c"],
         features: Float[Array, "q f"],
         there: Bool[Array, " q"],
-        trust: Float[Array, " q"] | None = None,
+        factor: Float[Array, " q"] | None = None,
     ) -> Float[Array, "q c"]:
         """Return the BEV features; cells that are not `there` stay exactly as they are.
 
@@ -80,9 +80,9 @@ class RasterFusion(nn.Module):
             bev: features of the cells.
             features: of the raster.
             there: cells that the raster has something to say about.
-            trust: factor of each cell, for markers in place of the frame's c of Eq. (3); None: 1.
+            factor: of each cell, for markers in place of the frame's c of Eq. (3); None: 1.
         """
         hidden = nn.relu(nn.Dense(self.hidden, name="hidden")(features))
         added = nn.Dense(bev.shape[-1], kernel_init=nn.initializers.zeros, name="output")(hidden)
-        added = added if trust is None else trust[:, None] * added
+        added = added if factor is None else factor[:, None] * added
         return jnp.where(there[:, None], bev + added, bev)

@@ -19,7 +19,7 @@ from tflane_jax.layers.polyline_encoder import PolylineEncoder, PolylineEncoderC
 from tflane_jax.layers.precision import run_part
 from tflane_jax.models.prior import BevCells, HostSpec, Prior
 from tflane_jax.models.token_fusion import TokenFusionConfig, attend_to_tokens
-from tflane_jax.priors.sd_map import SdMapPriorConfig, sd_map_tokens
+from tflane_jax.priors.sd_map import SdMapPriorConfig, sd_map_lines
 from tflane_jax.scene import Example, SdMap
 
 
@@ -58,7 +58,7 @@ SMALL_SD_MAP = SdMapModuleConfig(
 POINTS = 11
 
 
-class FusedSdMap(NamedTuple):
+class EncodedSdMap(NamedTuple):
     """Prior tokens of a frame's SD map, as every BEV layer reads them.
 
     Attributes:
@@ -90,11 +90,11 @@ class SdMapPrior(Prior):
         sd_map = SdMap.empty(0, POINTS) if example.sd_map is None else example.sd_map
         return jax.tree.map(jnp.asarray, sd_map), None
 
-    def encode(self, observation: SdMap, *, deterministic: bool) -> FusedSdMap:
+    def encode(self, observation: SdMap, *, deterministic: bool) -> EncodedSdMap:
         """Return the tokens of the lines."""
-        return FusedSdMap(*self.sd_map_tokens(observation, deterministic=deterministic), observation)
+        return EncodedSdMap(*self.sd_map_tokens(observation, deterministic=deterministic), observation)
 
-    def into_bev(self, tokens: FusedSdMap, layer: int, cells: BevCells) -> Float[Array, "q c"]:
+    def into_bev(self, tokens: EncodedSdMap, layer: int, cells: BevCells) -> Float[Array, "q c"]:
         """Return the BEV features with the map fused in."""
         fusion = SdMapFusion(self.config, name=f"sd_map_{layer}")
         mask = sd_map_mask(tokens.sd_map, cells.centers, self.config)
@@ -121,7 +121,7 @@ class SdMapEncoder(nn.Module):
                 without a map fit lines of 11 points, the default of `ExampleConfig.sd_map`.
             deterministic: no dropout. False needs the random key `dropout`.
         """
-        lines = sd_map_tokens(jax.tree.map(jnp.asarray, sd_map), self.config.prior, self.range)
+        lines = sd_map_lines(jax.tree.map(jnp.asarray, sd_map), self.config.prior, self.range)
         if not len(lines.valid) and not self.is_initializing():
             # Parameters for any number of points fit a map without lines.
             return jnp.zeros((0, self.config.lines.dim)), lines.valid

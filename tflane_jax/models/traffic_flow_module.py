@@ -27,7 +27,7 @@ from tflane_jax.limits import DIFFERENT, Count, CountOrZero, Rules, check_settin
 from tflane_jax.models.prior import BevCells, HostQueries, HostSpec, Prior
 from tflane_jax.models.raster_fusion import RasterFusion, TrafficRasterConfig
 from tflane_jax.models.traffic_masks import TrafficMaskConfig, sees_any, spatial_mask, temporal_mask
-from tflane_jax.priors.traffic_flow import TrafficFlowPriorConfig, TrafficFlowTokens, select_traffic_flow
+from tflane_jax.priors.traffic_flow import SelectedTracks, TrafficFlowPriorConfig, select_traffic_flow
 from tflane_jax.priors.traffic_raster import rasterise_traffic_flow
 from tflane_jax.scene import Example, RoadUser, TrafficFlow
 
@@ -128,7 +128,7 @@ class EncodedTrafficFlow(NamedTuple):
     """
 
     features: Float[Array, "t d"] | None
-    tracks: TrafficFlowTokens
+    tracks: SelectedTracks
 
 
 class TrafficFlowPrior(Prior):
@@ -151,17 +151,17 @@ class TrafficFlowPrior(Prior):
         """Return the temporal encoder."""
         return {} if self.temporal_encoder is None else {"temporal_encoder": self.temporal_encoder}
 
-    def observe(self, example: Example, memory: None) -> tuple[TrafficFlowTokens, None]:
+    def observe(self, example: Example, memory: None) -> tuple[SelectedTracks, None]:
         """Return `select` of an example's traffic flow; the prior remembers nothing."""
         return self.select(example.traffic_flow), None
 
-    def select(self, flow: TrafficFlow | None) -> TrafficFlowTokens:
+    def select(self, flow: TrafficFlow | None) -> SelectedTracks:
         """Return reTF_i; without traffic flow, all instances are invalid."""
         prior, host = self.config.prior, self.host
         tracks = jax.tree.map(jnp.asarray, TrafficFlow.empty(1, prior.frames)) if flow is None else flow
         return select_traffic_flow(tracks, prior, host.range, host.bev_range, host.forward)
 
-    def encode(self, observation: TrafficFlowTokens, *, deterministic: bool) -> EncodedTrafficFlow:
+    def encode(self, observation: SelectedTracks, *, deterministic: bool) -> EncodedTrafficFlow:
         """Return TF_Feat (T, D) beside the tracks that it encodes."""
         del deterministic
         features = None if self.temporal_encoder is None else self.temporal_encoder(observation)
@@ -213,24 +213,24 @@ class TemporalEncoder(nn.Module):
     coordinates: Literal["normalised", "metres"] = "normalised"
 
     @nn.compact
-    def __call__(self, tokens: TrafficFlowTokens) -> Float[Array, "t d"]:
+    def __call__(self, tracks: SelectedTracks) -> Float[Array, "t d"]:
         """Return TF_Feat; rows of invalid instances are finite but meaningless."""
-        x = self._embed(tokens)
+        x = self._embed(tracks)
         for i in range(self.config.depth):
-            mask = temporal_mask(self.config.masking, tokens.frame_valid)
+            mask = temporal_mask(self.config.masking, tracks.frame_valid)
             layer = partial(TemporalLayer, self.config.width, self.config.heads, name=f"layer_{i}")
             x = run_layer(self, layer, self.config, x, mask)
         x = nn.LayerNorm(name="norm")(x)
-        weight = tokens.frame_valid.astype(x.dtype)
+        weight = tracks.frame_valid.astype(x.dtype)
         mean = jnp.einsum("tnc,tn->tc", x, weight) / jnp.maximum(weight.sum(-1), 1.0)[:, None]
         if self.config.token == "mean":
             return Mlp((self.dim, self.dim), name="token")(mean)
         # The mean blurs the positions of a moving instance; its first and last valid frames keep them.
-        first = tokens.frame_valid.argmax(-1)
-        last = weight.shape[1] - 1 - tokens.frame_valid[:, ::-1].argmax(-1)
+        first = tracks.frame_valid.argmax(-1)
+        last = weight.shape[1] - 1 - tracks.frame_valid[:, ::-1].argmax(-1)
         ends = jnp.stack([first, last], 1)[..., None]
         # Select frames before encoding them: otherwise XLA would encode all frames a second time.
-        located = self._encode_places(*(jnp.take_along_axis(x, ends, 1) for x in (tokens.position, tokens.heading)))
+        located = self._encode_places(*(jnp.take_along_axis(x, ends, 1) for x in (tracks.position, tracks.heading)))
         return Mlp((self.dim, self.dim), name="token")(jnp.concatenate([mean, located.reshape(len(mean), -1)], -1))
 
     def _encode_places(self, position: Float[Array, "t n 3"], heading: Float[Array, "t n 2"]) -> Float[Array, "t n e"]:
@@ -240,12 +240,12 @@ class TemporalEncoder(nn.Module):
             position = jnp.concatenate([sine_encoding(plane, self.config.bands), position], -1)
         return jnp.concatenate([position, heading], -1)
 
-    def _embed(self, tokens: TrafficFlowTokens) -> Float[Array, "t n c"]:
+    def _embed(self, tracks: SelectedTracks) -> Float[Array, "t n c"]:
         """Encode position, heading, size, category and age of every frame."""
-        width, (instances, frames) = self.config.width, tokens.frame_valid.shape
-        x = nn.Dense(width, name="frame")(self._encode_places(tokens.position, tokens.heading))
-        category = nn.Embed(len(RoadUser), width, name="category")(tokens.category)
-        size = nn.Dense(width, use_bias=False, name="size")(tokens.size)
+        width, (instances, frames) = self.config.width, tracks.frame_valid.shape
+        x = nn.Dense(width, name="frame")(self._encode_places(tracks.position, tracks.heading))
+        category = nn.Embed(len(RoadUser), width, name="category")(tracks.category)
+        size = nn.Dense(width, use_bias=False, name="size")(tracks.size)
         age = self.param("age", nn.initializers.normal(0.02), (frames, width), jnp.float32)
         return x + (category + size)[:, None] + jnp.broadcast_to(age, (instances, frames, width))
 

@@ -17,7 +17,7 @@ from tflane_jax.geometry import PerceptionRange
 from tflane_jax.layers.masks import SpatialMask, causal_mask, key_mask, nearest_mask, track_distance
 from tflane_jax.limits import Count, PositiveOrInfinite
 from tflane_jax.models.prior import HostQueries
-from tflane_jax.priors.traffic_flow import TrafficFlowTokens
+from tflane_jax.priors.traffic_flow import SelectedTracks
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class TrafficMaskConfig:
 def spatial_mask(
     config: TrafficMaskConfig,
     queries: HostQueries,
-    tracks: TrafficFlowTokens,
+    tracks: SelectedTracks,
     coordinates: Literal["normalised", "metres"],
     bev_range: PerceptionRange,
 ) -> SpatialMask:

@@ -138,7 +138,7 @@ def frame_title(number: int, guidance: MarkerGuidance, *, remembered: bool) -> s
 def _entries(predicted: bool) -> list[Any]:
     from matplotlib.lines import Line2D
 
-    doubted, trusted = trust_colours(np.array([0.0, 1.0]))
+    doubted, trusted = lane_colours(np.array([0.0, 1.0]))
     lanes = {"lane of a board, c = 1": trusted, "c = 0": doubted} | (
         {"predicted lane": style.PREDICTION} if predicted else {}
     )
@@ -184,20 +184,20 @@ def draw_guidance(ax: Axes, guidance: MarkerGuidance) -> None:
         add_arrows(ax, lanes, colours, zorder=3.1)
 
 
-def trust_colours(trust: float | Float[np.ndarray, " n"]) -> list[str]:
-    """Return the colours of lanes by the confidence with which they enter the model, 0 to 1."""
+def lane_colours(factor: float | Float[np.ndarray, " n"]) -> list[str]:
+    """Return the colours of lanes by their factor in Eq. (3), c times weight, 0 to 1."""
     from matplotlib.colors import to_hex
 
-    fraction = np.clip(np.atleast_1d(trust), 0.0, 1.0)[:, None]
+    fraction = np.clip(np.atleast_1d(factor), 0.0, 1.0)[:, None]
     return [to_hex(colour) for colour in _DOUBTED + fraction * (_TRUSTED - _DOUBTED)]
 
 
 def _lanes(guidance: MarkerGuidance) -> tuple[Float[np.ndarray, "n k 3"], list[str]]:
     """Return the lanes of markers on the ground, with their colours; trusted ones last, so that they lie on top."""
-    weight = np.asarray(guidance.weight) * float(guidance.gate)
+    factor = np.asarray(guidance.weight) * float(guidance.gate)
     chosen = np.flatnonzero(guidance.valid)
-    chosen = chosen[np.argsort(weight[chosen], kind="stable")]
-    return np.pad(np.asarray(guidance.points)[chosen], ((0, 0), (0, 0), (0, 1))), trust_colours(weight[chosen])
+    chosen = chosen[np.argsort(factor[chosen], kind="stable")]
+    return np.pad(np.asarray(guidance.points)[chosen], ((0, 0), (0, 0), (0, 1))), lane_colours(factor[chosen])
 
 
 def _cameras(views: CameraViews, detected: DetectedMarkers) -> list[int]:

@@ -95,13 +95,15 @@ class MarkerMemory:
 
 @struct.dataclass
 class MarkerGuidance:
-    """Prior tokens of one frame: the union of Eq. (4), or the lanes of the frame alone.
+    """Weighted lanes that guide one frame: those of the union of Eq. (4), or those of the frame alone.
+
+    The encoder makes a token of each lane.
 
     Attributes:
         points: (N, K, 2) metres, ego frame.
-        weight: (N,) factor of each token; 0 where not valid.
-        confidence: (N,) of the marker of each token, decayed if it is remembered; 0 where not valid.
-        gate: () c of Eq. (3); 0 without tokens.
+        weight: (N,) factor of each lane's token; 0 where not valid.
+        confidence: (N,) of the marker of each lane, decayed if it is remembered; 0 where not valid.
+        gate: () c of Eq. (3); 0 without lanes.
         successor: (N, N) directed connectivity, between lanes of the same frame.
         valid: (N,).
     """
@@ -115,7 +117,7 @@ class MarkerGuidance:
 
 
 def guidance(observed: MarkerLanes, exponent: float = 1.0) -> MarkerGuidance:
-    """Return the prior tokens of a frame without memory."""
+    """Return the guidance of a frame without memory."""
     strongest = observed.frame_confidence
     relative = observed.confidence / jnp.where(strongest > 0, strongest, 1.0)
     return MarkerGuidance(
@@ -135,7 +137,7 @@ def remember(
     has_previous: Bool[Array, ""],
     config: MarkerMemoryConfig,
 ) -> tuple[MarkerMemory, MarkerGuidance]:
-    """Return the memory for the next frame and the prior tokens of this one.
+    """Return the memory for the next frame and the guidance of this one.
 
     Args:
         memory: of the previous frame.

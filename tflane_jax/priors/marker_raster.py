@@ -1,4 +1,4 @@
-"""Lanes of markers as a BEV raster: which lanes pass each cell, how, and how far they are trusted.
+"""Lanes of markers as a BEV raster: which lanes pass each cell, how, and the factor with which they enter Eq. (3).
 
 Ours, not in the marker paper; no parameters. A token of Eq. (3) is a whole lane, and every cell that attends to it gets
 the same value, so that a cell has to learn from the token where the lane passes. The raster gives
@@ -16,9 +16,9 @@ from tflane_jax.priors.bev_cells import cells_of
 from tflane_jax.priors.marker_memory import MarkerGuidance
 
 CHANNELS = 8
-"""Per cell: log(1 + points), trust; trust-weighted means of cos, sin, offset (2), start, end."""
+"""Per cell: log(1 + points), factor; means of cos, sin, offset (2), start, end, weighted by the factor."""
 
-# Weight of a lane without trust in the means of a cell, so that they are those of its direction and not 0 / 0.
+# Weight of a lane of factor 0 in the means of a cell, so that they are those of its direction and not 0 / 0.
 _LEAST = 1e-6
 
 
@@ -28,13 +28,15 @@ class MarkerRaster:
 
     Attributes:
         features: (Q, `CHANNELS`), 0 in cells without lanes: log(1 + number of points / (`between` + 1)); the largest
-            trust of these points' lanes; means over the points, weighted by trust, of cos and sin of the direction,
-            offset (x, y) from the cell centre in cells, first point of its lane (0 or 1), last point (0 or 1).
-        trust: (Q,) in [0, 1], c of Eq. (3) times the weight of Eq. (4) of the most trusted lane; 0 without lanes.
+            factor of these points' lanes; means over the points, weighted by the factor, of cos and sin of the
+            direction, offset (x, y) from the cell centre in cells, first point of its lane (0 or 1), last point (0 or
+            1).
+        factor: (Q,) in [0, 1], the largest of the lanes in the cell: c of Eq. (3) times the weight of Eq. (4); 0
+            without lanes.
     """
 
     features: Float[Array, "q f"]
-    trust: Float[Array, " q"]
+    factor: Float[Array, " q"]
 
 
 def rasterise_markers(lanes: MarkerGuidance, grid: BevGrid, between: int) -> MarkerRaster:
@@ -53,15 +55,15 @@ def rasterise_markers(lanes: MarkerGuidance, grid: BevGrid, between: int) -> Mar
     cell, offset = cells_of(grid.range.normalise(line), present, grid)
     ends = jnp.stack([jnp.arange(count) == 0, jnp.arange(count) == count - 1], -1)
     ends = jnp.broadcast_to(ends.astype(line.dtype), (*cell.shape, 2))
-    trust = jnp.broadcast_to(jnp.where(valid, lanes.weight * lanes.gate, 0.0)[:, None], cell.shape)
-    weight = jnp.maximum(trust, _LEAST)[..., None]
+    factor = jnp.broadcast_to(jnp.where(valid, lanes.weight * lanes.gate, 0.0)[:, None], cell.shape)
+    weight = jnp.maximum(factor, _LEAST)[..., None]
     weighted = weight * jnp.concatenate([direction, offset, ends], -1)
     summed = jnp.concatenate([jnp.ones_like(weight), weight, weighted], -1)
 
     cells, flat = grid.rows * grid.columns, cell.reshape(-1)
     total = jnp.zeros((cells, summed.shape[-1])).at[flat].add(summed.reshape(len(flat), summed.shape[-1]), mode="drop")
     number, weights, values = total[:, :1], total[:, 1:2], total[:, 2:]
-    strongest = jnp.zeros(cells).at[flat].max(trust.reshape(-1), mode="drop")
+    strongest = jnp.zeros(cells).at[flat].max(factor.reshape(-1), mode="drop")
     means = values / jnp.where(number > 0.0, weights, 1.0)
     amount = jnp.log1p(number / (between + 1))
     return MarkerRaster(jnp.concatenate([amount, strongest[:, None], means], -1), strongest)

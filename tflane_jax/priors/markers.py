@@ -110,17 +110,17 @@ def select_marker_lanes(markers: MarkerObservations, config: MarkerPriorConfig) 
     same = np.repeat(np.eye(count, dtype=bool), lanes, 0).repeat(lanes, 1)
     edges = xp.broadcast_to(markers.successor[:, :, None, :], (count, lanes, count, lanes))
     edges = edges.reshape(count * lanes, count * lanes) & same & valid[:, None] & valid[None, :]
-    trust = xp.where(valid, xp.repeat(marker_confidence(markers, config), lanes), 0.0)
+    lane_confidence = xp.where(valid, xp.repeat(marker_confidence(markers, config), lanes), 0.0)
     # To the lines, not to their points, which may be 10 m apart.
     vehicle, start = xp.zeros((1, 2), flat.dtype), flat[:, :-1]
     near = segment_distances(vehicle, start, flat[:, 1:] - start)[1].min(-1)
     # Stable: lanes of one marker keep their order if all have a place; padding comes last.
     near = xp.where(valid.sum() > config.lanes, near, 0.0)
-    order = xp.lexsort((near, xp.where(valid, -trust, xp.inf)))[: config.lanes]
+    order = xp.lexsort((near, xp.where(valid, -lane_confidence, xp.inf)))[: config.lanes]
     missing = config.lanes - len(order)
     return MarkerLanes(
         points=xp.pad(flat[order], ((0, missing), (0, 0), (0, 0))),
-        confidence=xp.pad(trust[order], (0, missing)),
+        confidence=xp.pad(lane_confidence[order], (0, missing)),
         successor=xp.pad(edges[order][:, order], ((0, missing), (0, missing))),
         valid=xp.pad(valid[order], (0, missing)),
     )

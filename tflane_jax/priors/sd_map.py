@@ -29,8 +29,8 @@ class SdMapPriorConfig:
 
 
 @struct.dataclass
-class SdMapTokens:
-    """Tokens of an SD map: R lines of P points.
+class SdMapLines:
+    """Lines of an SD map as the encoder reads them: R lines of P points.
 
     Attributes:
         points: (R, P, 2) in [0, 1] inside the range; 0 in padding.
@@ -43,8 +43,8 @@ class SdMapTokens:
     valid: Bool[Array, " r"]
 
 
-def sd_map_tokens(sd_map: SdMap, config: SdMapPriorConfig, bev_range: PerceptionRange) -> SdMapTokens:
-    """Return the tokens of one frame's SD map; padding may hold anything.
+def sd_map_lines(sd_map: SdMap, config: SdMapPriorConfig, bev_range: PerceptionRange) -> SdMapLines:
+    """Return the lines of one frame's SD map; padding may hold anything.
 
     Coordinates are normalised by `bev_range`, the box of the host's BEV features.
     """
@@ -53,7 +53,7 @@ def sd_map_tokens(sd_map: SdMap, config: SdMapPriorConfig, bev_range: Perception
     known = (sd_map.category >= 0) & (sd_map.category < config.categories)
     category = xp.where(known, sd_map.category, config.categories - 1)
     labels = (category[:, None] == xp.arange(config.categories)[None]) & sd_map.valid[:, None]
-    return SdMapTokens(
+    return SdMapLines(
         points=xp.where(sd_map.valid[:, None, None], bev_range.normalise(points), 0.0),
         labels=labels.astype(points.dtype),
         valid=sd_map.valid,

@@ -53,7 +53,7 @@ class TrafficFlowPriorConfig:
 
 
 @struct.dataclass
-class TrafficFlowTokens:
+class SelectedTracks:
     """reTF_i and its temporal mask: T_max instances of N frames, by descending weight.
 
     Attributes:
@@ -83,8 +83,8 @@ def select_traffic_flow(
     region: PerceptionRange,
     bev_range: PerceptionRange,
     forward: Literal["x", "y"] = "x",
-) -> TrafficFlowTokens:
-    """Return the tokens of one frame's traffic flow; padding in `flow` may hold anything.
+) -> SelectedTracks:
+    """Return the selected tracks of one frame's traffic flow; padding in `flow` may hold anything.
 
     Args:
         flow: tracks in the current frame of the host.
@@ -138,7 +138,7 @@ def select_traffic_flow(
     coordinates = position[order]
     if config.coordinates == "normalised":
         coordinates = bev_range.normalise(coordinates)
-    return TrafficFlowTokens(
+    return SelectedTracks(
         position=xp.where(frame_valid[..., None], coordinates, 0.0),
         heading=xp.where(frame_valid[..., None], xp.stack([xp.cos(yaw), xp.sin(yaw)], -1), 0.0),
         size=xp.where(filled[:, None], flow.size[order], 0.0),

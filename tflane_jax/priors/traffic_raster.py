@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float
 
 from tflane_jax.geometry import BevGrid
 from tflane_jax.priors.bev_cells import cells_of
-from tflane_jax.priors.traffic_flow import TrafficFlowTokens
+from tflane_jax.priors.traffic_flow import SelectedTracks
 from tflane_jax.scene import RoadUser
 
 FAR = 10.0
@@ -38,7 +38,7 @@ class TrafficRaster:
 
 
 def rasterise_traffic_flow(
-    tracks: TrafficFlowTokens, coordinates: Literal["normalised", "metres"], grid: BevGrid, between: int = 0
+    tracks: SelectedTracks, coordinates: Literal["normalised", "metres"], grid: BevGrid, between: int = 0
 ) -> TrafficRaster:
     """Return the raster of the selected tracks' valid frames; a position outside the grid is left out.
 

@@ -160,9 +160,9 @@ class MarkerDrive:
             following, prediction = self._step(self.model.params, self._memory, example)
             self._memory = following if self._model_remembers else None
             prediction = jax.device_get(prediction)
-        trust = np.asarray(marker_confidence(markers, self._prior.config.prior))
+        confidence = np.asarray(marker_confidence(markers, self._prior.config.prior))
         remembered = bool(guidance.valid.any()) and _reads_memory(markers, self._bank, self._prior.config)
-        return DriveStep(reading, trust, guidance, remembered, prediction)
+        return DriveStep(reading, confidence, guidance, remembered, prediction)
 
 
 def _reads_memory(markers: MarkerObservations, bank: MarkerMemory | None, config: MarkerFusionConfig) -> bool:

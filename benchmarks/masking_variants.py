@@ -60,7 +60,7 @@ def make_inputs(queries: int, prior: TrafficFlowConfig) -> tuple[HostQueries, Se
     valid = rng.random((BATCH, instances)) < 2 / 3
     heading = rng.standard_normal((BATCH, instances, frames, 2), np.float32)
     tracks = SelectedTracks(
-        position=jnp.asarray(rng.random((BATCH, instances, frames, 3), np.float32)),
+        position=jnp.asarray(RANGE.denormalise(rng.random((BATCH, instances, frames, 3), np.float32))),
         heading=jnp.asarray(heading / np.linalg.norm(heading, axis=-1, keepdims=True)),
         size=jnp.asarray(rng.random((BATCH, instances, 3), np.float32)),
         category=jnp.zeros((BATCH, instances), jnp.int32),
@@ -75,11 +75,12 @@ def make_inputs(queries: int, prior: TrafficFlowConfig) -> tuple[HostQueries, Se
 def program(config: TrafficFlowConfig, queries: HostQueries, tracks: SelectedTracks) -> tuple[Any, Any]:
     """Return the gradient of the module's squared output, and its parameters."""
     spec, module = HostSpec(DIM, RANGE, RANGE), config.module
-    temporal, spatial = TemporalEncoder(module, DIM, config.prior.coordinates), SpatialEncoder(module, DIM)
+    temporal = TemporalEncoder(module, DIM, spec.bev_range, config.prior.coordinates)
+    spatial = SpatialEncoder(module, DIM)
 
     def one(params, asked: HostQueries, flow: SelectedTracks):
         tokens = temporal.apply(params["temporal"], flow)
-        mask = spatial_mask(module.masking, asked, flow, config.prior.coordinates, spec.bev_range)
+        mask = spatial_mask(module.masking, asked, flow, spec.bev_range)
         return jnp.asarray(spatial.apply(params["spatial"], asked.features, asked.position, tokens, mask))
 
     def total(params, asked, flow):
@@ -89,7 +90,7 @@ def program(config: TrafficFlowConfig, queries: HostQueries, tracks: SelectedTra
     keys = jax.random.split(jax.random.key(0))
     start = {"temporal": jax.jit(temporal.init)(keys[0], flow)}
     tokens = temporal.apply(start["temporal"], flow)
-    mask = spatial_mask(module.masking, asked, flow, config.prior.coordinates, spec.bev_range)
+    mask = spatial_mask(module.masking, asked, flow, spec.bev_range)
     start["spatial"] = jax.jit(spatial.init)(keys[1], asked.features, asked.position, tokens, mask)
     return jax.grad(total), start
 

@@ -6,7 +6,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from tests.models.test_traffic_flow_module import CONFIG, DIM, LANES, apply, spatial, tokens
+from tests.models.test_traffic_flow_module import BEV, CONFIG, DIM, LANES, apply, spatial, tokens
 from tests.parameters import random_params
 from tflane_jax.models.traffic_flow_module import ALL_FUSIONS, LANE_FUSIONS, TemporalEncoder
 
@@ -43,14 +43,15 @@ def attended(params, query, key, value, allowed):
 def test_a_token_is_computed_from_all_that_is_known_of_its_track(depth):
     """Each frame with category, size and age, pre-norm layers over the valid frames, their mean, and the two ends."""
     track = tokens(2)
-    module = TemporalEncoder(dataclasses.replace(CONFIG, depth=depth), DIM)
+    module = TemporalEncoder(dataclasses.replace(CONFIG, depth=depth), DIM, BEV)
     variables = random_params(module.init, track)
     params = variables["params"]
     given = {field.name: np.asarray(getattr(track, field.name)) for field in dataclasses.fields(track)}
     assert len(set(given["category"][given["valid"]])) > 1
-    angle = 2.0 * np.pi * given["position"][..., :2, None].astype(float) / [2.0, 1.0, 0.5]
+    unit = (given["position"].astype(float) - BEV.low()) / BEV.size()
+    angle = 2.0 * np.pi * unit[..., :2, None] / [2.0, 1.0, 0.5]
     waves = angle.reshape(*angle.shape[:2], -1)
-    places = np.concatenate([np.sin(waves), np.cos(waves), given["position"], given["heading"]], -1)
+    places = np.concatenate([np.sin(waves), np.cos(waves), unit, given["heading"]], -1)
     found = apply(module, variables, track)
     for k in np.flatnonzero(given["valid"]):
         there = given["frame_valid"][k]

@@ -29,6 +29,7 @@ from tflane_jax.priors.traffic_flow import TrafficFlowPriorConfig, select_traffi
 CONFIG = TrafficFlowModuleConfig(width=8, heads=2, bands=3)
 PRIOR = TrafficFlowPriorConfig(max_instances=5)
 DIM, LANES = 12, 7
+BEV = BevGrid().range
 
 
 @partial(jax.jit, static_argnums=0)
@@ -38,9 +39,7 @@ def apply(module, params, *arguments):
 
 def tokens(seed=0, instances=4, **prior):
     flow = make_flow(seed, instances=instances)
-    return jax.tree.map(
-        jnp.asarray, select_traffic_flow(flow, dataclasses.replace(PRIOR, **prior), PerceptionRange(), BevGrid().range)
-    )
+    return jax.tree.map(jnp.asarray, select_traffic_flow(flow, dataclasses.replace(PRIOR, **prior), PerceptionRange()))
 
 
 def spatial(config, seed=0, valid=None, lane_mask=None):
@@ -55,7 +54,7 @@ def spatial(config, seed=0, valid=None, lane_mask=None):
 
 @pytest.mark.parametrize("depth", [0, 1, 3])
 def test_token_depends_on_valid_frames_only(depth):
-    module = TemporalEncoder(dataclasses.replace(CONFIG, depth=depth), DIM)
+    module = TemporalEncoder(dataclasses.replace(CONFIG, depth=depth), DIM, BEV)
     clean = tokens(1)
     params = random_params(module.init, clean)
     hole = ~clean.frame_valid[..., None]
@@ -66,7 +65,7 @@ def test_token_depends_on_valid_frames_only(depth):
 
 
 def test_token_sees_the_order_of_frames():
-    module = TemporalEncoder(CONFIG, DIM)
+    module = TemporalEncoder(CONFIG, DIM, BEV)
     forward = tokens(2, occluded_frames="keep")
     params = random_params(module.init, forward)
     whole = forward.replace(frame_valid=jnp.ones_like(forward.frame_valid))
@@ -76,7 +75,7 @@ def test_token_sees_the_order_of_frames():
 
 @pytest.mark.parametrize(("token", "ordered"), [("mean", False), ("mean_and_ends", True)])
 def test_only_the_ends_tell_the_order_of_frames_without_ages(token, ordered):
-    module = TemporalEncoder(dataclasses.replace(CONFIG, token=token), DIM)
+    module = TemporalEncoder(dataclasses.replace(CONFIG, token=token), DIM, BEV)
     forward = tokens(2, occluded_frames="keep")
     params = random_params(module.init, forward)
     params["params"]["age"] = jnp.zeros_like(params["params"]["age"])
@@ -89,7 +88,7 @@ def test_only_the_ends_tell_the_order_of_frames_without_ages(token, ordered):
 @pytest.mark.parametrize("token", ["mean", "mean_and_ends"])
 def test_frames_missing_at_the_end_are_none_at_all(token):
     """The mean is over the valid frames, and the last valid one is the end."""
-    module = TemporalEncoder(dataclasses.replace(CONFIG, token=token), DIM)
+    module = TemporalEncoder(dataclasses.replace(CONFIG, token=token), DIM, BEV)
     track = tokens(2, occluded_frames="keep")
     seen = jnp.broadcast_to(jnp.arange(track.frame_valid.shape[1])[None] < 7, track.frame_valid.shape)
     params = random_params(module.init, track)
@@ -97,6 +96,16 @@ def test_frames_missing_at_the_end_are_none_at_all(token):
     short = track.replace(position=track.position[:, :7], heading=track.heading[:, :7], frame_valid=seen[:, :7])
     params["params"]["age"] = params["params"]["age"][:7]
     np.testing.assert_allclose(found, apply(module, params, short), rtol=1e-4, atol=1e-5)
+
+
+def test_normalised_coordinates_span_the_bev():
+    """Without sines, they are what an encoder of metres computes from fractions of the box; 0 in missing frames."""
+    config, track = dataclasses.replace(CONFIG, position_encoding="linear"), tokens(2)
+    unit = (np.asarray(track.position, float) - BEV.low()) / BEV.size()
+    fractions = track.replace(position=jnp.asarray(np.where(track.frame_valid[..., None], unit, 0.0), jnp.float32))
+    normalised, metres = (TemporalEncoder(config, DIM, BEV, each) for each in ("normalised", "metres"))
+    params = random_params(normalised.init, track)
+    np.testing.assert_allclose(apply(normalised, params, track), apply(metres, params, fractions), atol=1e-5)
 
 
 def test_sines_of_coordinates_in_metres():

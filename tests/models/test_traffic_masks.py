@@ -39,10 +39,8 @@ LANES = np.stack([np.stack([np.linspace(-20, 20, 5), np.full(5, y)], -1) for y i
 TRACKS = np.stack([np.stack([np.linspace(0, 12, 3), np.full(3, y)], -1) for y in (10.0, -10.0, 10.0)])
 
 
-def tracks(coordinates="normalised"):
+def tracks():
     position = np.concatenate([TRACKS, np.zeros((3, 3, 1))], -1)
-    if coordinates == "normalised":
-        position = np.asarray(RANGE.normalise(position))
     valid = np.array([True, True, False])
     frame_valid = np.broadcast_to(valid[:, None], (3, 3)).copy()
     frame_valid[0, 0] = False
@@ -65,17 +63,16 @@ def queries(seed=0):
     return HostQueries(features, position, jnp.asarray(reference))
 
 
-def mask_of(config, coordinates="normalised"):
-    return spatial_mask(config, queries(), tracks(coordinates), coordinates, RANGE)
+def mask_of(config):
+    return spatial_mask(config, queries(), tracks(), RANGE)
 
 
-@pytest.mark.parametrize("coordinates", ["normalised", "metres"])
 @pytest.mark.parametrize("name", LOCAL)
-def test_lanes_see_the_vehicles_on_them(name, coordinates):
-    mask = mask_of(LOCAL[name], coordinates)
+def test_lanes_see_the_vehicles_on_them(name):
+    mask = mask_of(LOCAL[name])
     assert np.asarray(mask.lane_traffic).reshape(-1, 2, 3)[0].tolist() == [[True, False, False], [False, True, False]]
     assert np.asarray(mask.traffic_lane).reshape(-1, 3, 2)[0].tolist() == [[True, False], [False, True], [False, False]]
-    narrow = mask_of(replace(LOCAL[name], window=0.01), coordinates)  # the vehicles drive on the lines themselves
+    narrow = mask_of(replace(LOCAL[name], window=0.01))  # the vehicles drive on the lines themselves
     np.testing.assert_array_equal(narrow.lane_traffic, mask.lane_traffic)
 
 
@@ -121,10 +118,10 @@ def test_a_lane_hears_only_what_its_mask_allows(name):
 def test_no_traffic_equals_an_absent_prior(name):
     apply, params, (features, position, traffic, _) = encoder(name, LANE_FUSIONS)
     nobody = tracks().replace(valid=jnp.zeros(3, bool), frame_valid=jnp.zeros((3, 3), bool))
-    mask = spatial_mask(VARIANTS[name], queries(), nobody, "normalised", RANGE)
+    mask = spatial_mask(VARIANTS[name], queries(), nobody, RANGE)
     found = apply(params, features, position, traffic, mask)
     np.testing.assert_array_equal(apply(params, features, position, traffic * jnp.nan, mask), found)
-    absent = spatial_mask(VARIANTS[name], queries(), jax.tree.map(lambda leaf: leaf[:0], nobody), "normalised", RANGE)
+    absent = spatial_mask(VARIANTS[name], queries(), jax.tree.map(lambda leaf: leaf[:0], nobody), RANGE)
     without = apply(params, features, position, traffic[:0], absent)
     # One softmax adds up lanes and tokens, in an order that depends on their number.
     tolerance = 1e-6 if VARIANTS[name].softmax == "joint" else 0.0

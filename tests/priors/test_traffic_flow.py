@@ -11,14 +11,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tflane_jax.geometry import BevGrid, PerceptionRange
+from tflane_jax.geometry import PerceptionRange
 from tflane_jax.priors.traffic_flow import TrafficFlowPriorConfig, ego_centric_weight
 from tflane_jax.priors.traffic_flow import select_traffic_flow as select_within
 from tflane_jax.scene import TrafficFlow
 
 CONFIG = TrafficFlowPriorConfig(max_instances=6)
-REGION, BEV = PerceptionRange(), BevGrid().range
-select_traffic_flow = functools.partial(select_within, region=REGION, bev_range=BEV)
+REGION = PerceptionRange()
+select_traffic_flow = functools.partial(select_within, region=REGION)
 
 
 def make_flow(seed: int = 0, instances: int = 12, frames: int = 20, capacity: int = 16) -> TrafficFlow:
@@ -80,7 +80,7 @@ def test_selection_matches_plain_loops(seed, tolerance):
 @pytest.mark.parametrize("seed", range(3))
 def test_every_instance_keeps_its_own_size_category_heading_and_weight(seed):
     flow = make_flow(seed)
-    tracks = select_traffic_flow(flow, dataclasses.replace(CONFIG, coordinates="metres"))
+    tracks = select_traffic_flow(flow, CONFIG)
     assert tracks.valid.any()
     for slot in np.flatnonzero(tracks.valid):
         k, there = tracks.index[slot], tracks.frame_valid[slot]
@@ -94,12 +94,10 @@ def test_every_instance_keeps_its_own_size_category_heading_and_weight(seed):
         assert tracks.weight[slot] == pytest.approx(weight_at(x, y, CONFIG), rel=1e-5)
 
 
-@pytest.mark.parametrize("coordinates", ["normalised", "metres"])
-def test_jit_gives_the_same(coordinates):
-    config = dataclasses.replace(CONFIG, coordinates=coordinates)
+def test_jit_gives_the_same():
     flow = make_flow(3)
-    host = select_traffic_flow(flow, config)
-    device = jax.jit(lambda f: select_traffic_flow(f, config))(jax.tree.map(jnp.asarray, flow))
+    host = select_traffic_flow(flow, CONFIG)
+    device = jax.jit(lambda f: select_traffic_flow(f, CONFIG))(jax.tree.map(jnp.asarray, flow))
     for field in dataclasses.fields(host):
         a, b = getattr(host, field.name), np.asarray(getattr(device, field.name))
         assert a.dtype.kind == b.dtype.kind, field.name
@@ -116,12 +114,13 @@ def test_padding_may_hold_nan():
     jax.tree.map(np.testing.assert_array_equal, select_traffic_flow(flow, CONFIG), select_traffic_flow(dirty, CONFIG))
 
 
-def test_normalised_coordinates_span_the_bev():
-    flow = make_flow(5)
-    metres = select_traffic_flow(flow, dataclasses.replace(CONFIG, coordinates="metres"))
-    unit = select_traffic_flow(flow, CONFIG)
-    back = BEV.denormalise(unit.position)
-    np.testing.assert_allclose(back[unit.frame_valid], metres.position[unit.frame_valid], atol=1e-4)
+def test_positions_are_metres_whatever_the_encoder_reads():
+    """The setting is that of the temporal encoder."""
+    found = [
+        select_traffic_flow(make_flow(5), dataclasses.replace(CONFIG, coordinates=coordinates))
+        for coordinates in ("normalised", "metres")
+    ]
+    jax.tree.map(np.testing.assert_array_equal, *found)
 
 
 @pytest.mark.parametrize(("instances", "capacity", "frames"), [(0, 4, 20), (1, 1, 20), (3, 4, 22), (0, 0, 20)])

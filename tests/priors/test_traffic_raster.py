@@ -20,14 +20,14 @@ GRID = BevGrid(rows=10, columns=20)
 CONFIG = TrafficFlowPriorConfig(max_instances=10)
 
 
-@partial(jax.jit, static_argnums=(1, 2, 3))
-def rasterise(tracks, coordinates="normalised", grid=GRID, between=0):
-    return rasterise_traffic_flow(tracks, coordinates, grid, between)
+@partial(jax.jit, static_argnums=(1, 2))
+def rasterise(tracks, grid=GRID, between=0):
+    return rasterise_traffic_flow(tracks, grid, between)
 
 
 def select(flow, **options):
     config = dataclasses.replace(CONFIG, **options)
-    return jax.tree.map(jnp.asarray, select_traffic_flow(flow, config, PerceptionRange(), GRID.range))
+    return jax.tree.map(jnp.asarray, select_traffic_flow(flow, config, PerceptionRange()))
 
 
 def loop_raster(tracks, grid, between):
@@ -62,20 +62,19 @@ def loop_raster(tracks, grid, between):
 @pytest.mark.parametrize("seed", [0, 1])
 def test_raster_equals_loops(seed, between):
     flow = make_flow(seed)
-    metres = jax.tree.map(np.asarray, select(flow, coordinates="metres"))
-    features, touched = loop_raster(metres, GRID, between)
+    tracks = select(flow)
+    features, touched = loop_raster(jax.tree.map(np.asarray, tracks), GRID, between)
     assert len(touched) > 10
-    for tracks, coordinates in ((select(flow), "normalised"), (select(flow, coordinates="metres"), "metres")):
-        raster = rasterise(tracks, coordinates, GRID, between)
-        np.testing.assert_array_equal(np.flatnonzero(raster.touched), touched)
-        np.testing.assert_allclose(raster.features, features, atol=2e-5)
+    raster = rasterise(tracks, GRID, between)
+    np.testing.assert_array_equal(np.flatnonzero(raster.touched), touched)
+    np.testing.assert_allclose(raster.features, features, atol=2e-5)
 
 
 def test_order_of_instances_changes_nothing():
     tracks = select(make_flow(2))
     order = np.random.default_rng(0).permutation(CONFIG.max_instances)
     permuted = jax.tree.map(lambda leaf: leaf[order], tracks)
-    a, b = (rasterise(t, "normalised", GRID, 1) for t in (tracks, permuted))
+    a, b = (rasterise(t, GRID, 1) for t in (tracks, permuted))
     np.testing.assert_array_equal(a.touched, b.touched)
     np.testing.assert_allclose(a.features, b.features, atol=1e-6)
 
@@ -86,7 +85,7 @@ def test_frames_that_are_not_valid_may_hold_anything():
     dirty = tracks.replace(
         position=jnp.where(hole, jnp.nan, tracks.position), heading=jnp.where(hole, jnp.nan, tracks.heading)
     )
-    a, b = (rasterise(t, "normalised", GRID, 1) for t in (tracks, dirty))
+    a, b = (rasterise(t, GRID, 1) for t in (tracks, dirty))
     jax.tree.map(np.testing.assert_array_equal, a, b)
     assert a.touched.any()
 
@@ -106,7 +105,7 @@ def test_interpolation_fills_the_gaps_of_a_fast_road_user():
     tracks = select(flow, min_valid_frames=5)
     fine = BevGrid(rows=25, columns=50)
     row = fine.columns * 12
-    gaps, path = (np.asarray(rasterise(tracks, "normalised", fine, n).touched)[row:][:50] for n in (0, 3))
+    gaps, path = (np.asarray(rasterise(tracks, fine, n).touched)[row:][:50] for n in (0, 3))
     assert gaps.sum() == 20
     assert path[3:46].all()
 
@@ -119,6 +118,6 @@ def test_borders_of_the_grid():
     wide = PerceptionRange((-99, 99), (-99, 99))
     for shift, cells in ((0.0, [GRID.rows * GRID.columns - 1]), (0.1, [])):
         moved = flow.replace(position=flow.position + np.float32(shift))
-        tracks = select_traffic_flow(moved, CONFIG, wide, GRID.range)
+        tracks = select_traffic_flow(moved, CONFIG, wide)
         raster = rasterise(jax.tree.map(jnp.asarray, tracks))
         assert np.flatnonzero(raster.touched).tolist() == cells

@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from tflane_jax.geometry import PerceptionRange
 from tflane_jax.layers.attention import MultiHeadAttention
 from tflane_jax.layers.graph import Mlp
 from tflane_jax.layers.masks import SpatialMask
@@ -140,12 +141,11 @@ class TrafficFlowPrior(Prior):
     reads = ("traffic_flow",)
 
     def __init__(self, config: TrafficFlowConfig, host: HostSpec):
-        self.config, self.host = config, host
-        coordinates = config.prior.coordinates
-        self.temporal_encoder = None
+        self.config, self.host, self.temporal_encoder = config, host, None
         if config.insert != "nowhere":
             # Named as in a host, so that a module of one's own can take the parameters of a trained host.
-            self.temporal_encoder = TemporalEncoder(config.module, host.dim, coordinates, name="temporal_encoder")
+            box, coordinates = host.bev_range, config.prior.coordinates
+            self.temporal_encoder = TemporalEncoder(config.module, host.dim, box, coordinates, name="temporal_encoder")
 
     def modules(self) -> dict[str, nn.Module]:
         """Return the temporal encoder."""
@@ -159,7 +159,7 @@ class TrafficFlowPrior(Prior):
         """Return reTF_i; without traffic flow, all instances are invalid."""
         prior, host = self.config.prior, self.host
         tracks = jax.tree.map(jnp.asarray, TrafficFlow.empty(1, prior.frames)) if flow is None else flow
-        return select_traffic_flow(tracks, prior, host.range, host.bev_range, host.forward)
+        return select_traffic_flow(tracks, prior, host.range, host.forward)
 
     def encode(self, observation: SelectedTracks, *, deterministic: bool) -> EncodedTrafficFlow:
         """Return TF_Feat (T, D) beside the tracks that it encodes."""
@@ -176,8 +176,7 @@ class TrafficFlowPrior(Prior):
         config = self.config.bev
         if config is None or not config.enters(layer):
             return cells.features
-        tracks = jax.tree.map(jnp.asarray, tokens.tracks)
-        raster = rasterise_traffic_flow(tracks, self.config.prior.coordinates, cells.grid, config.between)
+        raster = rasterise_traffic_flow(jax.tree.map(jnp.asarray, tokens.tracks), cells.grid, config.between)
         fuse = RasterFusion(config.hidden, name=f"traffic_flow_{layer}")
         return fuse(cells.features, raster.features, raster.touched)
 
@@ -187,15 +186,12 @@ class TrafficFlowPrior(Prior):
             return queries.features
         config = self.config
         queries.check(self.host)
-        mask = spatial_mask(
-            config.module.masking, queries, tokens.tracks, config.prior.coordinates, self.host.bev_range
-        )
+        mask = spatial_mask(config.module.masking, queries, tokens.tracks, self.host.bev_range)
         features = tokens.features
         if len(queries.groups) > 1 and "T->L" in config.module.fusions:
             # Tokens that read lanes would carry what they read from one group to another: each group has its own.
             mask, features = mask.by_group(queries.groups), jnp.concatenate([features] * len(queries.groups))
-        name = f"spatial_encoder_{layer}"
-        spatial = SpatialEncoder(config.module, self.host.dim, self.host.query_type, name=name)
+        spatial = SpatialEncoder(config.module, self.host.dim, self.host.query_type, name=f"spatial_encoder_{layer}")
         return spatial(queries.features, queries.position, features, mask)
 
 
@@ -205,16 +201,21 @@ class TemporalEncoder(nn.Module):
     Attributes:
         config: shape.
         dim: channels of the token.
-        coordinates: of the positions, see `TrafficFlowPriorConfig.coordinates`.
+        range: the box that normalised coordinates span, that of the host's BEV features.
+        coordinates: see `TrafficFlowPriorConfig.coordinates`.
     """
 
     config: TrafficFlowModuleConfig
     dim: int
+    range: PerceptionRange
     coordinates: Literal["normalised", "metres"] = "normalised"
 
     @nn.compact
     def __call__(self, tracks: SelectedTracks) -> Float[Array, "t d"]:
         """Return TF_Feat; rows of invalid instances are finite but meaningless."""
+        if self.coordinates == "normalised":  # still 0 in frames that are not valid
+            unit = jnp.where(tracks.frame_valid[..., None], self.range.normalise(tracks.position), 0.0)
+            tracks = tracks.replace(position=unit)
         x = self._embed(tracks)
         for i in range(self.config.depth):
             mask = temporal_mask(self.config.masking, tracks.frame_valid)
@@ -319,8 +320,7 @@ class SpatialEncoder(nn.Module):
 
         # Padding may hold anything, NaN included.
         traffic = jnp.where(mask.valid[:, None], traffic, 0.0)
-        # A traffic token carries its own position already.
-        none = jnp.zeros_like(traffic)
+        none = jnp.zeros_like(traffic)  # a traffic token carries its own position already
         fused = lanes
         for i in range(config.spatial_depth):
             if config.masking.softmax == "joint":

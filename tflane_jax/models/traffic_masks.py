@@ -49,11 +49,7 @@ class TrafficMaskConfig:
 
 
 def spatial_mask(
-    config: TrafficMaskConfig,
-    queries: HostQueries,
-    tracks: SelectedTracks,
-    coordinates: Literal["normalised", "metres"],
-    bev_range: PerceptionRange,
+    config: TrafficMaskConfig, queries: HostQueries, tracks: SelectedTracks, bev_range: PerceptionRange
 ) -> SpatialMask:
     """Return M_s with the restrictions of `config`.
 
@@ -61,15 +57,13 @@ def spatial_mask(
         config: restrictions.
         queries: of the host.
         tracks: selected instances.
-        coordinates: of the tracks' positions.
-        bev_range: the box that normalised coordinates span.
+        bev_range: the box that the queries' reference lines span.
     """
     mask = SpatialMask.from_validity(len(queries.features), tracks.valid, queries.mask)
     if not config.local:
         return mask
-    position = tracks.position if coordinates == "metres" else bev_range.denormalise(tracks.position)
     lanes = bev_range.denormalise(jax.lax.stop_gradient(queries.reference))
-    distance = track_distance(lanes[..., :2], position[..., :2], tracks.frame_valid)
+    distance = track_distance(lanes[..., :2], tracks.position[..., :2], tracks.frame_valid)
     if config.window is not None:
         mask = mask.restricted(distance <= config.window)
     if config.nearest is not None:

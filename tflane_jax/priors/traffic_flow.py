@@ -33,7 +33,8 @@ class TrafficFlowPriorConfig:
         occluded_frames: "mask" ignores frames in which the tracker did not see the box (Fig. 4); "keep" uses them.
         front_sector_deg: opening angle of the front sector, which has the highest weight (paper: 60).
         distance_scale: distance that halves the weight of an instance outside that sector, metres.
-        coordinates: "normalised" aligns positions with the BEV in [0, 1] (Table 5, "Norm." = T); "metres" does not.
+        coordinates: of positions as the temporal encoder reads them: "normalised" aligns them with the BEV in [0, 1]
+            (Table 5, "Norm." = T); "metres" does not.
     """
 
     frames: Count = 20
@@ -57,7 +58,7 @@ class SelectedTracks:
     """reTF_i and its temporal mask: T_max instances of N frames, by descending weight.
 
     Attributes:
-        position: (T, N, 3) box centres, normalised or metres per the config; 0 where not valid.
+        position: (T, N, 3) box centres, metres, frame of the host; 0 where not valid.
         heading: (T, N, 2) cos and sin of the yaw in the ego frame; 0 where not valid.
         size: (T, 3) length, width, height, metres; 0 in padding.
         category: (T,) `scene.RoadUser`; 0 in padding.
@@ -81,7 +82,6 @@ def select_traffic_flow(
     flow: TrafficFlow,
     config: TrafficFlowPriorConfig,
     region: PerceptionRange,
-    bev_range: PerceptionRange,
     forward: Literal["x", "y"] = "x",
 ) -> SelectedTracks:
     """Return the selected tracks of one frame's traffic flow; padding in `flow` may hold anything.
@@ -90,7 +90,6 @@ def select_traffic_flow(
         flow: tracks in the current frame of the host.
         config: selection.
         region: R_t, the host's perception range; positions outside it are ignored.
-        bev_range: the box of the host's BEV features, which normalised coordinates span.
         forward: axis of the host's frame that points ahead: y in the axes of nuScenes' lidar.
 
     Raises:
@@ -135,11 +134,8 @@ def select_traffic_flow(
 
     frame_valid = frame_valid[order] & filled[:, None]
     yaw = xp.where(frame_valid, flow.yaw[order], 0.0)
-    coordinates = position[order]
-    if config.coordinates == "normalised":
-        coordinates = bev_range.normalise(coordinates)
     return SelectedTracks(
-        position=xp.where(frame_valid[..., None], coordinates, 0.0),
+        position=xp.where(frame_valid[..., None], position[order], 0.0),
         heading=xp.where(frame_valid[..., None], xp.stack([xp.cos(yaw), xp.sin(yaw)], -1), 0.0),
         size=xp.where(filled[:, None], flow.size[order], 0.0),
         category=xp.where(filled, flow.category[order], 0),

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
 import jax
 import jax.numpy as jnp
 from flax import struct
@@ -37,21 +35,18 @@ class TrafficRaster:
     touched: Bool[Array, " q"]
 
 
-def rasterise_traffic_flow(
-    tracks: SelectedTracks, coordinates: Literal["normalised", "metres"], grid: BevGrid, between: int = 0
-) -> TrafficRaster:
+def rasterise_traffic_flow(tracks: SelectedTracks, grid: BevGrid, between: int = 0) -> TrafficRaster:
     """Return the raster of the selected tracks' valid frames; a position outside the grid is left out.
 
     Args:
         tracks: as selected by the traffic-flow prior.
-        coordinates: of `tracks.position`; normalised ones span the grid's range.
         grid: the cells.
         between: points interpolated between successive frames that are both valid, so that the path of a fast road
             user has no gaps. A point counts as 1 / (between + 1) frames; so does a frame that no valid one follows,
             because it has no points but its own.
     """
     position, valid = tracks.position[..., :2], tracks.frame_valid
-    unit = jnp.where(valid[..., None], position if coordinates == "normalised" else grid.range.normalise(position), 0.0)
+    unit = jnp.where(valid[..., None], grid.range.normalise(position), 0.0)
     heading = jnp.where(valid[..., None], tracks.heading, 0.0)
     moved = jnp.minimum(_distance(unit, valid, grid) / FAR, 1.0)
     category = jax.nn.one_hot(tracks.category, len(RoadUser))

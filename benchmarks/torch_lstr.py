@@ -79,16 +79,16 @@ def training_step(
     if weights is not None:
         load(network, weights)
     network.train()
-    optimiser = torch.optim.Adam(network.parameters(), LEARNING_RATE)
+    optimizer = torch.optim.Adam(network.parameters(), LEARNING_RATE)
     images, masks = torch.from_numpy(batch.images), torch.from_numpy(batch.masks)
     targets = [torch.from_numpy(rows) for rows in batch.targets]
 
     def step() -> float:
         logits, curves, _ = network(images, masks)
         loss, _ = fitting_loss(logits, curves, targets)
-        optimiser.zero_grad()
+        optimizer.zero_grad()
         loss.backward()
-        optimiser.step()
+        optimizer.step()
         return loss.item()
 
     return step

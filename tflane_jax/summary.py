@@ -62,7 +62,7 @@ def prediction_program(task: AnyTask, example: Any, *, compiled: bool = True) ->
 def training_program(
     task: AnyTask, example: Any, batch_size: int, optim: OptimConfig, *, accumulate: int = 1, compiled: bool = True
 ) -> Program:
-    """Return the cost of an update: loss, gradient, optimiser, moving average; of clips if the task is one of clips.
+    """Return the cost of an update: loss, gradient, optimizer, moving average; of clips if the task is one of clips.
 
     With `accumulate`, the batch passes in that many parts; operations are those of all of them.
     """

@@ -1,4 +1,4 @@
-"""The GTN network overfits ten real TuSimple frames: network, loss and optimiser can fit real lanes.
+"""The GTN network overfits ten real TuSimple frames: network, loss and optimizer can fit real lanes.
 
     tflane train --config gtn_lane/overfit --data.root TUSIMPLE
     tflane eval runs/overfit

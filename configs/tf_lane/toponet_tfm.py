@@ -3,7 +3,7 @@
     tflane train --config tf_lane/toponet_tfm
     tflane train --config tf_lane/toponet_tfm:street
 
-Same data, optimiser and host as `toponet.py`: the preset `city`, and for all ablations `street`. The paper runs its
+Same data, optimizer and host as `toponet.py`: the preset `city`, and for all ablations `street`. The paper runs its
 ablations on LaneSegNet (`lanesegnet_tfm.py`); here they run on TopoNet.
 
 `tflane tables tf_lane.2`, 2,500 updates, eight seeds, recall of hidden lanes that vehicles drove along, percent:

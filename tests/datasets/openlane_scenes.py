@@ -14,7 +14,7 @@ FRAMES, STEP = 3, 2.5
 # The ego axes in a camera that looks ahead.
 AHEAD = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 # Two lanes one after the other, and one beside them; global frame.
-CENTRELINES = [[(0.0, 0.0), (20.0, 0.0)], [(20.0, 0.0), (38.0, 6.0)], [(0.0, 3.5), (20.0, 3.5)]]
+CENTERLINES = [[(0.0, 0.0), (20.0, 0.0)], [(20.0, 0.0), (38.0, 6.0)], [(0.0, 3.5), (20.0, 3.5)]]
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class DriveDataset:
             count = graph.points.shape[1]
             fraction = np.linspace(0, 1, count)[:, None]
             for row, number in enumerate(order):
-                start, end = (np.array([*point, 0.3]) for point in CENTRELINES[number])
+                start, end = (np.array([*point, 0.3]) for point in CENTERLINES[number])
                 graph.points[row] = transform_points(invert_pose(pose), start + fraction * (end - start))
                 graph.is_connector[row] = number == 1
             side = np.array([0.0, 1.7, 0.0])

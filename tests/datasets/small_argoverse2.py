@@ -114,7 +114,7 @@ def write_images(folder: Path, images, point):
         width, height = CAMERAS[name][:2]
         image = np.zeros((height, width, 3), np.uint8)
         u, v = np.round(pixel(name, time, point)[0]).astype(int)
-        image[v - 3 : v + 3, u - 3 : u + 3] = 255  # its centre is the corner of four pixels
+        image[v - 3 : v + 3, u - 3 : u + 3] = 255  # its center is the corner of four pixels
         path = folder / "sensors" / "cameras" / name / f"{time * MS}.jpg"
         path.parent.mkdir(parents=True, exist_ok=True)
         assert cv2.imwrite(str(path), image)

@@ -49,7 +49,7 @@ def root(written, tmp_path):
 
 
 def bright(image):
-    """Return the centre of what is bright in an image, pixels from its corner."""
+    """Return the center of what is bright in an image, pixels from its corner."""
     weight = image.mean(-1) * (image.mean(-1) > 60)
     v, u = np.indices(weight.shape) + 0.5
     return np.array([(u * weight).sum(), (v * weight).sum()]) / weight.sum()

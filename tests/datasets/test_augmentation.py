@@ -151,9 +151,9 @@ def test_points_stay_on_the_painted_line(seed, larger):
     across = np.stack([np.arange(-5, 5.5, 0.5), np.zeros(21)], -1).astype(np.float32)
     profile = cv2.remap(after.image, points[:, None] + across, None, cv2.INTER_LINEAR)[..., 0].astype(float)
     assert profile[:, 10].min() > 150
-    centre = (profile * across[:, 0]).sum(1) / profile.sum(1)
-    assert abs(np.median(centre)) < 0.15
-    assert np.abs(centre).max() < 1.0
+    center = (profile * across[:, 0]).sum(1) / profile.sum(1)
+    assert abs(np.median(center)) < 0.15
+    assert np.abs(center).max() < 1.0
 
 
 @settings(max_examples=60)

@@ -14,8 +14,8 @@ cv2 = pytest.importorskip("cv2")
 SECOND = 10**9
 
 
-def camera(name, centre=(30.5, 20.0), **more):
-    intrinsics = np.array([[90.0, 0.0, centre[0]], [0.0, 91.0, centre[1]], [0.0, 0.0, 1.0]])
+def camera(name, center=(30.5, 20.0), **more):
+    intrinsics = np.array([[90.0, 0.0, center[0]], [0.0, 91.0, center[1]], [0.0, 0.0, 1.0]])
     return DriveCamera(name, intrinsics, yaw_pose(np.ones(1), np.zeros(1), np.zeros(1))[0], **more)
 
 

@@ -15,7 +15,7 @@ from tflane_jax.world.roads.sd_map import SdMapConfig
 
 
 def earth(latitude, longitude):
-    """Return WGS84 places (degrees) in Earth-centred metres."""
+    """Return WGS84 places (degrees) in Earth-centered metres."""
     f = 1 / 298.257223563
     e2, lat, lon = f * (2 - f), np.radians(latitude), np.radians(longitude)
     n = 6378137.0 / np.sqrt(1 - e2 * np.sin(lat) ** 2)

@@ -1,4 +1,4 @@
-"""Boundaries of lanes from centre lines and outlines that can be drawn on paper."""
+"""Boundaries of lanes from center lines and outlines that can be drawn on paper."""
 
 import numpy as np
 
@@ -27,7 +27,7 @@ def test_sides_lie_on_the_outline():
 
 
 def test_slanted_ends_and_lines_longer_than_the_outline_keep_the_width():
-    # The outline is cut off slantingly at both ends, and the centre line sticks out of it.
+    # The outline is cut off slantingly at both ends, and the center line sticks out of it.
     lane = LaneOutline(ALONG, ring((2, -2), (16, -2), (19, 2), (5, 2)))
     widths = half_widths(lane)
     np.testing.assert_allclose(widths[:, 6:15], 2.0, atol=1e-9)

@@ -341,7 +341,7 @@ def test_lines_are_cut_by_maptrs_rules(root):
     length = np.linalg.norm(np.diff(boundary, axis=0), axis=-1).sum()
     assert length == pytest.approx(13.05 + 40 + 7 + 40 + 9.55, abs=6.0)  # 20 points cut the corners
     # One path through the lane graph: the lane and its connector, on the circle of 10 m around (390, 1130), up to the
-    # patch's border 5.94 m north of its centre.
+    # patch's border 5.94 m north of its center.
     (path,) = found[LineClass.CENTERLINE]
     np.testing.assert_allclose(path[0], [start, 0.0], atol=1e-3)
     np.testing.assert_allclose(path[-1], [30.0, 10 - np.sqrt(100 - 5.94**2)], atol=2e-2)

@@ -32,23 +32,23 @@ def labelled(record, camera):
     return boxes, lidar2cam, record["cam_instances"][camera]
 
 
-# In CAM_FRONT_LEFT no labelled centre lies inside the image.
+# In CAM_FRONT_LEFT no labelled center lies inside the image.
 @pytest.mark.parametrize("camera", ["CAM_FRONT", "CAM_FRONT_RIGHT", "CAM_BACK", "CAM_BACK_LEFT", "CAM_BACK_RIGHT"])
-def test_box_centres_are_where_they_are_labelled(keyframe, camera):
-    """Through the ego frame, as an example holds it: K (camera_from_ego ego_from_lidar) centre."""
+def test_box_centers_are_where_they_are_labelled(keyframe, camera):
+    """Through the ego frame, as an example holds it: K (camera_from_ego ego_from_lidar) center."""
     _, record = keyframe
     boxes, lidar2cam, instances = labelled(record, camera)
     image = record["images"][camera]
     camera_from_ego = invert_pose(np.array(image["cam2ego"]))
     intrinsics = np.array(image["cam2img"])[:3, :3]
     ego_from_lidar = np.linalg.inv(camera_from_ego) @ lidar2cam
-    centres = boxes[:, :3] @ ego_from_lidar[:3, :3].T + ego_from_lidar[:3, 3]
-    pixels, depth, valid = project(centres, intrinsics, camera_from_ego)
+    centers = boxes[:, :3] @ ego_from_lidar[:3, :3].T + ego_from_lidar[:3, 3]
+    pixels, depth, valid = project(centers, intrinsics, camera_from_ego)
     seen = valid & inside_image(pixels, 1600, 900)
     stored = np.array([instance["center_2d"] for instance in instances])
     stored_depth = np.array([instance["depth"] for instance in instances])
     assert seen.any()
-    # Every labelled centre inside the image is that of a box, at its depth.
+    # Every labelled center inside the image is that of a box, at its depth.
     apart = np.linalg.norm(stored[:, None] - pixels[valid], axis=-1)
     inside = inside_image(stored, 1600, 900)
     matched = apart[inside].argmin(-1)
@@ -92,14 +92,14 @@ def test_the_pose_chain_of_the_tables_gives_the_same_pixels(keyframe):
     cameras = sample_cameras(tables, sample, tables.ego_pose(sample))
     assert [camera.name for camera in cameras] == list(CAMERAS)
     boxes = np.array([instance["bbox_3d"] for instance in record["instances"]])
-    centres = transform_points(ego_from_lidar, boxes[:, :3])
+    centers = transform_points(ego_from_lidar, boxes[:, :3])
     apart = []
     for camera in cameras:
         _, lidar2cam, instances = labelled(record, camera.name)
         np.testing.assert_allclose(
             invert_pose(camera.ego_from_camera), lidar2cam @ invert_pose(ego_from_lidar), atol=1e-4
         )
-        pixels, _, valid = project(centres, camera.intrinsics, invert_pose(camera.ego_from_camera))
+        pixels, _, valid = project(centers, camera.intrinsics, invert_pose(camera.ego_from_camera))
         stored = np.array([instance["center_2d"] for instance in instances])
         inside = inside_image(stored, 1600, 900)
         apart += np.linalg.norm(stored[inside][:, None] - pixels[valid], axis=-1).min(-1).tolist()

@@ -65,8 +65,8 @@ def drive(headings, speed=5.0, category=RoadUser.CAR, frames=4):
     time, along = np.arange(frames) / 2, np.stack([np.cos(headings), np.sin(headings)], -1)
     poses = yaw_pose(3.0 * time, -time, time)
     tracks = Tracks.empty(frames, [str(k) for k in range(len(headings))])
-    centre = np.concatenate([speed * time[:, None, None] * along, np.ones((frames, len(headings), 1))], -1)
-    tracks.position[:] = transform_points(invert_pose(poses), centre)
+    center = np.concatenate([speed * time[:, None, None] * along, np.ones((frames, len(headings), 1))], -1)
+    tracks.position[:] = transform_points(invert_pose(poses), center)
     tracks.yaw[:] = wrap_angle(headings - time[:, None])
     tracks.category[:], tracks.valid[:] = category, True
     return tracks, poses, (time * 1e9).astype(np.int64)

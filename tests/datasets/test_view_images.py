@@ -10,7 +10,7 @@ from tflane_jax.datasets.view_images import LANESEGNET_BUCKET, ImageConfig, fit_
 
 @pytest.mark.parametrize(("shrink", "expected"), [("area", 85.0), ("bilinear", 255.0)])
 def test_images_below_half_size_are_averaged_or_sampled(shrink, expected):
-    """One white column of three: an average sees a third of it, a sample at its centre all of it."""
+    """One white column of three: an average sees a third of it, a sample at its center all of it."""
     image = np.zeros((9, 9, 3), np.uint8)
     image[:, 1::3] = 255
     fit = fit_image(9, 9, ImageConfig(scale=1 / 3 + 1e-9, shrink=shrink), front=False)

@@ -21,9 +21,9 @@ def ring(x, y, points=9):
 def scene(garbage=np.nan):
     """Return three segments (rows 0 -> 2 ahead of each other, 3 beside), their centerlines, areas and elements."""
     start = np.array([[0, 0, 0], [0, 0, 0], [10, 0, 0], [0, 4, 0]], float)
-    centre = start[:, None] + np.linspace(0, 10, 5)[:, None] * [1, 0, 0]
+    center = start[:, None] + np.linspace(0, 10, 5)[:, None] * [1, 0, 0]
     side = np.array([0, 2, 0])
-    lines = [np.where(VALID[:, None, None], line, garbage).astype(np.float32) for line in (centre, centre + side)]
+    lines = [np.where(VALID[:, None, None], line, garbage).astype(np.float32) for line in (center, center + side)]
     successor = np.zeros((4, 4), bool)
     successor[0, 2] = True
     successor[1, 1] = np.isnan(garbage)
@@ -31,13 +31,13 @@ def scene(garbage=np.nan):
         LaneGraph.empty(4, 5),
         points=lines[0],
         left=lines[1],
-        right=np.where(VALID[:, None, None], centre - side, garbage).astype(np.float32),
+        right=np.where(VALID[:, None, None], center - side, garbage).astype(np.float32),
         visibility=np.where(VALID, np.float32(0.5), garbage),
         successor=successor,
         valid=VALID,
     )
     # The merged centerline of rows 0 and 2, and that of row 3; the first row is padding.
-    whole = np.stack([np.full((5, 3), garbage), np.linspace((0, 0, 0), (20, 0, 0), 5), centre[3]]).astype(np.float32)
+    whole = np.stack([np.full((5, 3), garbage), np.linspace((0, 0, 0), (20, 0, 0), 5), center[3]]).astype(np.float32)
     lanes = dataclasses.replace(LaneGraph.empty(3, 5), points=whole, valid=np.array([False, True, True]))
     areas = Areas(
         np.stack([np.full((9, 3), garbage), ring(5, -4), ring(30, -4)]).astype(np.float32),
@@ -106,7 +106,7 @@ def perfect(garbage=0.0, successor=None):
     n = 4
     edges = np.zeros((n, n)) if successor is None else successor
     edges[:3, :3] = np.where(truth.lanes.successor, 0.9, 0.1)
-    centre = np.concatenate([np.asarray(truth.lanes.points), np.full((1, 5, 3), garbage)])
+    center = np.concatenate([np.asarray(truth.lanes.points), np.full((1, 5, 3), garbage)])
     assert truth.lanes.elements is not None
     found = ElementDetections(
         truth.lanes.elements.boxes,
@@ -115,14 +115,14 @@ def perfect(garbage=0.0, successor=None):
         np.concatenate([np.where(truth.lanes.elements.lane, 0.9, 0.1), np.ones((1, 2))]),
     )
     scores, classes = np.array([0.3, 0.9, 0.6, 0.8]), np.array([0, 0, 0, 1])
-    return (centre, points[0], points[1], classes, scores, edges), found, truth
+    return (center, points[0], points[1], classes, scores, edges), found, truth
 
 
 def test_detections_are_sorted_by_score_and_crossings_become_areas():
-    (centre, left, right, classes, scores, edges), elements, _ = perfect()
-    found = segment_detections(centre, left, right, classes, scores, edges, elements=elements)
+    (center, left, right, classes, scores, edges), elements, _ = perfect()
+    found = segment_detections(center, left, right, classes, scores, edges, elements=elements)
     np.testing.assert_array_equal(found.lanes.scores, [0.9, 0.6, 0.3])
-    np.testing.assert_array_equal(found.lanes.points, centre[[1, 2, 0]])
+    np.testing.assert_array_equal(found.lanes.points, center[[1, 2, 0]])
     np.testing.assert_array_equal(found.left, left[[1, 2, 0]])
     np.testing.assert_array_equal(found.right, right[[1, 2, 0]])
     assert found.lanes.successor[2, 0] == 0.9  # row 0 continues in row 1

@@ -112,15 +112,15 @@ def pinhole_image_curve(curve: GroundCurve, focal: float, height: float, pitch: 
     )
 
 
-def normalised_image_curve(curve: ImageCurve, centre: tuple[float, float], size: tuple[float, float]) -> ImageCurve:
+def normalised_image_curve(curve: ImageCurve, center: tuple[float, float], size: tuple[float, float]) -> ImageCurve:
     """Return the same curve with rows and columns as fractions of the image, counted from its top-left corner.
 
     Args:
         curve: in pixels from the principal point.
-        centre: principal point (u, v), pixels.
+        center: principal point (u, v), pixels.
         size: width and height, pixels.
     """
-    (cu, cv), (width, height) = centre, size
+    (cu, cv), (width, height) = center, size
     return ImageCurve(
         k=curve.k / height**2 / width,
         f=(curve.f + cv) / height,

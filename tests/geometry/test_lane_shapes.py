@@ -92,11 +92,11 @@ def test_the_papers_tilt_is_right_for_small_pitch_only():
 @given(curves, pitches)
 def test_normalised_curves_are_the_same_curves(curve, pitch):
     image = pinhole_image_curve(curve, FOCAL, HEIGHT, pitch)
-    centre, (width, height) = (630.0, 350.0), (1280.0, 720.0)
-    fractions = vector(normalised_image_curve(image, centre, (width, height)))
+    center, (width, height) = (630.0, 350.0), (1280.0, 720.0)
+    fractions = vector(normalised_image_curve(image, center, (width, height)))
     rows = photographed(curve, pitch)[:, 1]
-    expected = (curve_columns(vector(image), rows) + centre[0]) / width
-    np.testing.assert_allclose(curve_columns(fractions, (rows + centre[1]) / height), expected, rtol=1e-7, atol=1e-9)
+    expected = (curve_columns(vector(image), rows) + center[0]) / width
+    np.testing.assert_allclose(curve_columns(fractions, (rows + center[1]) / height), expected, rtol=1e-7, atol=1e-9)
 
 
 def test_lanes_of_a_road_share_all_but_two_coefficients():

@@ -30,7 +30,7 @@ def test_corners():
     assert not RANGE.contains(np.array([0.0, 25.001, 0.0]))
 
 
-def test_pixel_of_each_cell_centre_is_its_index():
+def test_pixel_of_each_cell_center_is_its_index():
     grid = BevGrid(RANGE, rows=9, columns=16)
     assert grid.cell == pytest.approx((5.0, 5.0))
     x, y = grid.centers()

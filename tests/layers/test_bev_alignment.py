@@ -22,7 +22,7 @@ def test_rotation_matches_torchvision(path):
     assert names
     for name in names:
         i, image = name.removesuffix(".img"), case.inputs[name].transpose(1, 2, 0)
-        # torchvision turns about the middle of the image where no centre is given.
+        # torchvision turns about the middle of the image where no center is given.
         middle = image.shape[1] / 2, image.shape[0] / 2
         center = tuple(float(x) for x in case.inputs.get(f"{i}.center_xy", middle))
         got = turn(image, np.deg2rad(case.inputs[f"{i}.angle"]), center).transpose(2, 0, 1)

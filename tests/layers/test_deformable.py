@@ -81,7 +81,7 @@ def test_heads_look_around_their_own_points():
     module = DeformableAttention(4, heads=2, points=1)
     rng = np.random.default_rng(1)
     value, query = (jnp.asarray(rng.normal(size=(n, 4)).astype(np.float32)) for n in (36, 1))
-    centre, outside = [0.5, 0.5], [9.0, 9.0]
+    center, outside = [0.5, 0.5], [9.0, 9.0]
 
     @jax.jit
     def run(reference):
@@ -92,11 +92,11 @@ def test_heads_look_around_their_own_points():
 
     bias = out(outside, outside)
     np.testing.assert_allclose(
-        out(centre, centre) - bias, out(centre, outside) + out(outside, centre) - 2 * bias, atol=1e-6
+        out(center, center) - bias, out(center, outside) + out(outside, center) - 2 * bias, atol=1e-6
     )
-    np.testing.assert_array_equal(out(centre, centre), out(centre))
+    np.testing.assert_array_equal(out(center, center), out(center))
     with pytest.raises(ValueError, match="1 or 2 points"):
-        out(centre, centre, centre)
+        out(center, center, center)
 
 
 def test_offsets_count_in_cells_around_a_point_and_in_halves_of_a_box():

@@ -61,13 +61,13 @@ def test_sample_reproduces_a_plane_and_its_slope():
 
 
 @pytest.mark.slow
-def test_the_slope_at_a_cell_centre_is_that_to_the_next_cell():
+def test_the_slope_at_a_cell_center_is_that_to_the_next_cell():
     """The first locations of deformable attention lie there. Those of a grid of powers of two are exact in float32."""
     h, w = 4, 8
     grid = np.random.default_rng(0).normal(size=(h, w)).astype(np.float32)
     rows, columns = np.mgrid[:h, :w]
-    centres = jnp.asarray(np.stack([(columns + 0.5) / w, (rows + 0.5) / h], -1).reshape(-1, 2), jnp.float32)
-    slope = jax.vmap(jax.grad(lambda at: sample_bilinear(jnp.asarray(grid.reshape(-1, 1)), (h, w), at)[0]))(centres)
+    centers = jnp.asarray(np.stack([(columns + 0.5) / w, (rows + 0.5) / h], -1).reshape(-1, 2), jnp.float32)
+    slope = jax.vmap(jax.grad(lambda at: sample_bilinear(jnp.asarray(grid.reshape(-1, 1)), (h, w), at)[0]))(centers)
     beyond = np.pad(grid, ((0, 1), (0, 1)))
     expected = np.stack([(beyond[:h, 1:] - grid) * w, (beyond[1:, :w] - grid) * h], -1)
     np.testing.assert_allclose(np.asarray(slope).reshape(h, w, 2), expected, rtol=1e-5, atol=1e-5)

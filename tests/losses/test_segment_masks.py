@@ -19,10 +19,10 @@ def make_boundaries(seed, count, length=12.0, width=3.0):
     heading = rng.uniform(0, 2 * np.pi, count)[:, None] + np.linspace(0, 1, 6) * rng.uniform(-1, 1, (count, 1))
     middle = rng.uniform(-0.8, 0.8, (count, 1, 2)) * np.array([10.0, 5.0])
     step = length / 6 * np.stack([np.cos(heading), np.sin(heading)], -1)
-    centre = np.cumsum(step, 1) - step.sum(1, keepdims=True) / 2 + middle
+    center = np.cumsum(step, 1) - step.sum(1, keepdims=True) / 2 + middle
     across = width / 2 * np.stack([-np.sin(heading), np.cos(heading)], -1)
     height = np.zeros((count, 6, 1))
-    return (np.concatenate([centre + sign * across, height], -1).astype(np.float32) for sign in (1, -1))
+    return (np.concatenate([center + sign * across, height], -1).astype(np.float32) for sign in (1, -1))
 
 
 def inside(x, y, ring):
@@ -34,7 +34,7 @@ def inside(x, y, ring):
     return odd
 
 
-def test_cells_whose_centre_lies_inside():
+def test_cells_whose_center_lies_inside():
     left, right = make_boundaries(0, 12)
     grid = BevGrid(RANGE, rows=7, columns=13)
     found = np.asarray(jax.jit(lambda a, b: segment_masks(a, b, (7, 13), RANGE))(left, right))

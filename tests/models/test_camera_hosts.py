@@ -76,8 +76,8 @@ def test_predicts_lanes_elements_and_both_topologies(fitted):
     chex.assert_shape(answer.elements.box, (5, 2, 2))
     chex.assert_shape(answer.elements.lane_logits, (6, 5))
     assert np.abs(np.asarray(answer.centerlines.points)[..., 0]).max() <= 51.2
-    centre = np.asarray(answer.elements.box).mean(1)
-    assert ((centre >= 0) & (centre <= [96, 64])).all()
+    center = np.asarray(answer.elements.box).mean(1)
+    assert ((center >= 0) & (center <= [96, 64])).all()
     other = fitted.predict(make_camera_example(1))
     for before, after in zip(jax.tree.leaves(answer), jax.tree.leaves(other), strict=True):
         assert not np.array_equal(before, after)

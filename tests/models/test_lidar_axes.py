@@ -83,7 +83,7 @@ def test_what_lies_on_the_ground_takes_the_level_pose():
     )
     moved = example.replace(previous_from_ego=yaw_pose(*np.float32([3.0, 0.5, 0.1])))
     ahead = np.asarray(in_lidar_axes(moved).previous_from_ego)
-    np.testing.assert_allclose(ahead[:2, 3], [-0.5, 3.0], atol=0.15)  # the lidar is not the centre of the turn
+    np.testing.assert_allclose(ahead[:2, 3], [-0.5, 3.0], atol=0.15)  # the lidar is not the center of the turn
     np.testing.assert_array_equal(turned.map_lines.points, example.map_lines.points)
 
 

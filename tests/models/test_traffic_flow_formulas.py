@@ -18,8 +18,9 @@ def dense(params, x):
 
 
 def normalised(params, x):
-    centred = x - x.mean(-1, keepdims=True)
-    return centred / np.sqrt(x.var(-1, keepdims=True) + 1e-6) * np.asarray(params["scale"]) + np.asarray(params["bias"])
+    centered = x - x.mean(-1, keepdims=True)
+    scale, bias = np.asarray(params["scale"]), np.asarray(params["bias"])
+    return centered / np.sqrt(x.var(-1, keepdims=True) + 1e-6) * scale + bias
 
 
 def feed_forward(params, x):

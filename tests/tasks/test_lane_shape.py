@@ -104,7 +104,7 @@ def test_padding_content_changes_nothing(fitted):
     jax.tree.map(np.testing.assert_array_equal, answer, fitted.predict(fitted.params, soiled))
     assert not np.array_equal(answer.curves.logits, fitted.predict(fitted.params, road_image(0)).curves.logits)
 
-    # The optimiser's first moment is the gradient, scaled.
+    # The optimizer's first moment is the gradient, scaled.
     (state, metrics), other = (fitted.updated(pair(example)) for example in (clean, soiled))
     assert metrics["finite"]
     jax.tree.map(np.testing.assert_array_equal, (numbers(state), metrics), (numbers(other[0]), other[1]))

@@ -229,7 +229,7 @@ def test_a_checkpoint_of_another_model_is_refused(tmp_path, state):
     checkpoints = saved(tmp_path, state, [(1, None)])
     with pytest.raises(UserError, match=r"does not fit.*line/bias is float32\[3\], not float32\[4\]"):
         checkpoints.restore(1, state_of(task=LineTask(features=4)))
-    with pytest.raises(UserError, match="another model, optimiser or number of seeds"):
+    with pytest.raises(UserError, match="another model, optimizer or number of seeds"):
         checkpoints.restore(1, state_of(seeds=(0, 1)))
     with pytest.raises(UserError, match="params/second/offset"):
         checkpoints.restore(1, state_of(task=LineTask(second_layer=True)))

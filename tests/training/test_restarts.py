@@ -88,7 +88,7 @@ def test_lengths_do_not_overflow():
 
 
 def test_restarts_have_no_schedule_by_step():
-    with pytest.raises(ValueError, match="optimiser's state"):
+    with pytest.raises(ValueError, match="optimizer's state"):
         make_schedule(OptimConfig(warmup_steps=0, restarts=RestartsConfig()), 10)
 
 

@@ -191,7 +191,7 @@ def test_schedule_by_epoch_is_constant_within_epochs(epoch_steps, steps):
 
 
 def rates_of(config: OptimConfig, steps: int, count: int) -> np.ndarray:
-    """Return the learning rates of the first `count` updates of a run, as the optimiser applies them."""
+    """Return the learning rates of the first `count` updates of a run, as the optimizer applies them."""
     optimizer, rate = make_optimizer(config, steps), make_rate(config, steps)
     nothing = as_vectors({"kernel": jnp.zeros((1, 1))})
 

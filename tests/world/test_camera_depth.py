@@ -25,7 +25,7 @@ CAMERA = PinholeCamera(64, 48, np.array([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]])
 
 
 def block(x, width=2.0, height=3.0):
-    """Return a box of two metres' length with its centre ahead of the camera."""
+    """Return a box of two metres' length with its center ahead of the camera."""
     solid = Solid()
     box(solid, np.array([x, 0.0]), 0.0, (2.0, width), (0.0, height), (0.5, 0.5, 0.5))
     return solid, (x, 0.0, 2.0, width, 0.0, 0.0, height)

@@ -57,9 +57,9 @@ def test_building_hides_at_any_height_and_across_the_half_turn():
 
 def test_excluded_box_hides_only_the_others():
     boxes = np.array([TRUCK, [20.0, 0.0, 4.0, 2.0, 0.0, 3.5, 0.0]])
-    centres = boxes[:, :2]
-    assert hidden_points(centres, boxes, NO_BUILDINGS, target_height=1.0).tolist() == [True, True]
-    own = hidden_points(centres, boxes, NO_BUILDINGS, target_height=1.0, exclude=np.arange(2))
+    centers = boxes[:, :2]
+    assert hidden_points(centers, boxes, NO_BUILDINGS, target_height=1.0).tolist() == [True, True]
+    own = hidden_points(centers, boxes, NO_BUILDINGS, target_height=1.0, exclude=np.arange(2))
     assert own.tolist() == [False, True]
 
 

@@ -123,7 +123,7 @@ def test_staggered_side_streets_lie_apart_on_opposite_sides():
         parts = int(shapely.get_num_geometries(groups))
         assert parts == (1 if stagger < 16.0 else 2)
         one, two = one + (parts == 1), two + (parts == 2)
-        # Where the side streets meet the main road: ends of the shortest pieces of the roads' centre lines.
+        # Where the side streets meet the main road: ends of the shortest pieces of the roads' center lines.
         ends = np.array([road[0, :2] for road in net.map.roads[1 if parts == 2 else 0 :]])
         spread = max(np.linalg.norm(a - b) for a, b in itertools.combinations(ends, 2))
         assert spread == pytest.approx(stagger, abs=0.5) or (stagger < 60.0 and spread > stagger)

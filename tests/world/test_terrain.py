@@ -67,7 +67,7 @@ def test_hills_change_nothing_but_heights(log):
     there = log.actors.valid
     boxes = [transform_points(x.global_from_ego, x.actors.position)[there] for x in (log, level)]
     np.testing.assert_allclose(boxes[0][:, :2], boxes[1][:, :2], atol=1e-9)
-    # They stand on the ground: the centre of a box is half its height above.
+    # They stand on the ground: the center of a box is half its height above.
     np.testing.assert_allclose(boxes[0][:, 2] - terrain.height(boxes[0][:, :2]), boxes[1][:, 2], atol=1e-9)
     turned = np.abs(np.sin(log.actors.yaw - level.actors.yaw))[there]
     assert 0.0 < turned.max() < 0.02

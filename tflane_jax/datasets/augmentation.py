@@ -48,7 +48,7 @@ class AugmentationConfig:
 
     Attributes:
         geometry: probability of rotation, flip and crop.
-        rotation: maximum rotation about the centre to either side, radians.
+        rotation: maximum rotation about the center to either side, radians.
         flip: probability of a mirror image, given that geometry is applied.
         crop: fraction of height and width that is cut out anywhere in the image and enlarged to its size.
         brightness, contrast, saturation: maximum change of each factor from 1; they are applied in random order.
@@ -121,7 +121,7 @@ def warp_example(example: RoadImage, warp: Float[np.ndarray, "3 3"] | None, size
     height, width = example.image_valid.shape
     lines = example.lines if warp is None else warp_lines(example.lines, warp, height, width)
     resized = np.diag([size[1] / width, size[0] / height, 1.0]) @ (np.eye(3) if warp is None else warp)
-    # OpenCV counts from the centre of the first pixel, and reads the map from the new image to the old.
+    # OpenCV counts from the center of the first pixel, and reads the map from the new image to the old.
     half = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])
     inverse = (np.linalg.inv(half) @ np.linalg.inv(resized) @ half)[:2]
     seen = np.asarray(example.image_valid, np.uint8)

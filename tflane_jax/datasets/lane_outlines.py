@@ -1,7 +1,7 @@
-"""Left and right boundaries of lanes for maps that store only centre lines and, for some lanes, outlines.
+"""Left and right boundaries of lanes for maps that store only center lines and, for some lanes, outlines.
 
-In nuScenes a centre line may start and end inside the lane's outline, and lanes through intersections have no outline.
-The boundaries run beside the centre line: where a line across it meets the outline, or half a width away.
+In nuScenes a center line may start and end inside the lane's outline, and lanes through intersections have no outline.
+The boundaries run beside the center line: where a line across it meets the outline, or half a width away.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 # Metres: half the width of a lane of which nothing is known.
 HALF_WIDTH = 1.75
-# Metres; an outline farther from the centre line than this is not the side of a lane.
+# Metres; an outline farther from the center line than this is not the side of a lane.
 _FARTHEST = 8.0
 # Of a lane's median half width; a smaller one is that of an end of the outline, which is slanted or ends here.
 _NARROWEST = 0.6
@@ -34,9 +34,9 @@ class LaneOutline:
 
 
 def half_widths(lane: LaneOutline) -> Float[np.ndarray, "2 n"] | None:
-    """Return the distance from each point of the centre line to the outline, to the left and to the right, metres.
+    """Return the distance from each point of the center line to the outline, to the left and to the right, metres.
 
-    None without an outline, or where it is nowhere beside the centre line.
+    None without an outline, or where it is nowhere beside the center line.
     """
     if lane.outline is None or len(lane.outline) < 3:
         return None
@@ -48,7 +48,7 @@ def half_widths(lane: LaneOutline) -> Float[np.ndarray, "2 n"] | None:
 def boundaries(
     lanes: Mapping[int, LaneOutline], successors: Mapping[int, Sequence[int]]
 ) -> dict[int, tuple[np.ndarray, np.ndarray]]:
-    """Return the left and right boundary (n, 2) of each lane, points beside those of its centre line.
+    """Return the left and right boundary (n, 2) of each lane, points beside those of its center line.
 
     The width of a lane without an outline goes evenly from that of the lanes before it to that of the lanes after it.
 

@@ -1,4 +1,4 @@
-"""Centre lines of the nuScenes map expansion: chains of arcs and straight pieces, integrated exactly.
+"""Center lines of the nuScenes map expansion: chains of arcs and straight pieces, integrated exactly.
 
 A path has three pieces of curvature +1/radius (L), -1/radius (R) or 0 (S); a lane is a list of paths. Points lie at
 equal steps of at most the resolution, by the rule of the devkit (`map_expansion/arcline_path_utils.py`).

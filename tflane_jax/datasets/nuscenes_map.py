@@ -25,7 +25,7 @@ from tflane_jax.files.fields import items, load_json, member, numbers
 from tflane_jax.scene import LineType
 from tflane_jax.scene.logs import LaneSegment, VectorMap
 
-# MapTRv2 discretises centre lines at half a metre.
+# MapTRv2 discretises center lines at half a metre.
 RESOLUTION = 0.5
 # Older files lack arclines.
 _FIRST_VERSION = (1, 3)

@@ -1,7 +1,7 @@
 """Scenes of nuScenes as plain npz files: tracks, ego path, lanes, dividers and the drivable boundary of one scene each.
 
 A file has what ScenarioNet keeps of a scene (https://github.com/metadriverse/scenarionet): boxes by instance at 2 Hz,
-lane outlines with centre lines, dividers, the border of the drivable area. It has no images, no crossings and no
+lane outlines with center lines, dividers, the border of the drivable area. It has no images, no crossings and no
 visibility. It has no connectivity either: lanes are joined where their ends coincide. Keys:
 
     instance_token, category (K,); size_wlh (K, 3); position (F, K, 3); yaw, valid (F, K); ego_position (F, 3);

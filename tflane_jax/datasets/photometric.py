@@ -157,7 +157,7 @@ def draw_grid(
 
 
 def _between_stripes(size: int, period: int, kept: int, start: int) -> Bool[np.ndarray, " size"]:
-    """Return which of `size` pixels lie in no stripe; the stripes begin at `start` in 1.5 times the size, centred."""
+    """Return which of `size` pixels lie in no stripe; the stripes begin at `start` in 1.5 times the size, centered."""
     whole = int(1.5 * size)
     at = np.arange(size) + (whole - size) // 2 - start
     return (at < 0) | (at >= whole // period * period) | (at % period >= kept)

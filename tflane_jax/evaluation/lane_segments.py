@@ -66,7 +66,7 @@ def truth_of_segments(
 
 
 def segment_detections(
-    centre: Float[np.ndarray, "q p 3"],
+    center: Float[np.ndarray, "q p 3"],
     left: Float[np.ndarray, "q p 3"],
     right: Float[np.ndarray, "q p 3"],
     classes: Int[np.ndarray, " q"],
@@ -83,7 +83,7 @@ def segment_detections(
     sides; the area is the left line followed by the reversed right line, 2 P points.
 
     Args:
-        centre, left, right: metres, ego frame, in driving direction.
+        center, left, right: metres, ego frame, in driving direction.
         classes: index into `SEGMENT_CLASSES`.
         scores: confidence, 0 to 1.
         successor: [i, j] confidence that segment j continues segment i, 0 to 1.
@@ -100,9 +100,9 @@ def segment_detections(
         elements = ElementDetections(
             elements.boxes, elements.attributes, elements.scores, np.asarray(elements.lane)[rows]
         )
-    centre, left, right, scores = (np.asarray(array) for array in (centre, left, right, scores))
+    center, left, right, scores = (np.asarray(array) for array in (center, left, right, scores))
     return SegmentDetections(
-        lanes=LaneDetections(centre[rows], scores[rows], np.asarray(successor)[np.ix_(rows, rows)], elements),
+        lanes=LaneDetections(center[rows], scores[rows], np.asarray(successor)[np.ix_(rows, rows)], elements),
         left=left[rows],
         right=right[rows],
         areas=AreaDetections(

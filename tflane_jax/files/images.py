@@ -141,7 +141,7 @@ def read_image(path: Path) -> UInt8[np.ndarray, "h w 3"]:
 def check_centre(path: Path, image: UInt8[np.ndarray, "h w 3"], intrinsics: Float[np.ndarray, "3 3"]) -> None:
     """Raise UserError if the principal point shows that an image has another size than the calibration.
 
-    It is outside of the image, or off its centre in both directions alike, as cropping alone seldom leaves it.
+    It is outside of the image, or off its center in both directions alike, as cropping alone seldom leaves it.
     """
     height, width = image.shape[:2]
     x, y = intrinsics[:2, 2]
@@ -175,7 +175,7 @@ def undistorted(
             f"{path} has {width} x {height} pixels; lens distortion can be removed up to {LARGEST_SIDE} on a side: "
             "make it smaller, and its intrinsics"
         )
-    # OpenCV's pixel origin is the centre of the first pixel, ours its corner.
+    # OpenCV's pixel origin is the center of the first pixel, ours its corner.
     shifted = intrinsics - np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])
     return opencv().undistort(image, shifted, np.array(distortion))
 

@@ -1,7 +1,7 @@
 """Pinhole cameras: from the ego frame to pixels and from pixels back to the ground.
 
 Camera frame: x right, y down, z along the optical axis, metres. Pixels: (u right, v down) from the top-left **corner**
-of the image, so that the centre of the first pixel is (0.5, 0.5) and resizing is a plain multiplication. Intrinsics
+of the image, so that the center of the first pixel is (0.5, 0.5) and resizing is a plain multiplication. Intrinsics
 are the 3 x 3 matrix K, the extrinsic is `camera_from_ego` (SE(3)). Leading axes broadcast; numpy or jax.
 """
 

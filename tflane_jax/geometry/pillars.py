@@ -17,7 +17,7 @@ from tflane_jax.geometry.ranges import BevGrid
 
 
 def cell_points(grid: BevGrid) -> Float[np.ndarray, "q 2"]:
-    """Return the centres (x, y) of the cells, row by row, in [0, 1] across the grid's range."""
+    """Return the centers (x, y) of the cells, row by row, in [0, 1] across the grid's range."""
     x = (np.arange(grid.columns) + 0.5) / grid.columns
     y = (np.arange(grid.rows) + 0.5) / grid.rows
     return np.stack(np.meshgrid(x, y), -1).reshape(-1, 2).astype(np.float32)

@@ -68,7 +68,7 @@ class BevGrid:
         return size[0] / self.columns, size[1] / self.rows
 
     def centers(self) -> tuple[list[float], list[float]]:
-        """Return the coordinates of the cell centres, metres: x of each column, y of each row."""
+        """Return the coordinates of the cell centers, metres: x of each column, y of each row."""
         (dx, dy), (x0, y0) = self.cell, self.range.low(2)
         return (
             [x0 + (c + 0.5) * dx for c in range(self.columns)],
@@ -76,7 +76,7 @@ class BevGrid:
         )
 
     def pixel(self, points: Float[ArrayT, "*b d"]) -> Float[ArrayT, "*b 2"]:
-        """Map metres to continuous (column, row) with cell centres at integers."""
+        """Map metres to continuous (column, row) with cell centers at integers."""
         unit = self.range.normalise(points[..., :2])
         return unit * _like(unit, (self.columns, self.rows)) - 0.5
 

@@ -25,7 +25,7 @@ def sample_bilinear(
     Args:
         value: features of an (h, w) grid, row-major.
         shape: (h, w).
-        location: (x, y) in [0, 1] across the grid's outer borders; cell centres lie at (i + 0.5) / size.
+        location: (x, y) in [0, 1] across the grid's outer borders; cell centers lie at (i + 0.5) / size.
     """
     flat = location.reshape(-1, 1, 1, 1, 2)
     start = jnp.zeros(flat.shape[0], jnp.int32)
@@ -66,7 +66,7 @@ class _Corners(NamedTuple):
 
     Attributes:
         row: of the upper left one, in the table (cells * heads, d) of a value (cells, heads, d).
-        x, y: from its centre to the location, in cells, in [-1, 2).
+        x, y: from its center to the location, in cells, in [-1, 2).
     """
 
     row: Int[Array, "*rounds n j"]
@@ -108,7 +108,7 @@ def _hat(offset, several):
 def _slope(offset, several):
     """Return the derivatives of `_hat`; at a kink, that to the right, but 0 at -1, which marks a location outside.
 
-    Many first samples lie at a kink: locations at cell centres, with offsets of whole cells.
+    Many first samples lie at a kink: locations at cell centers, with offsets of whole cells.
     """
     first = jnp.where(jnp.abs(offset) < 1.0, jnp.where(offset < 0.0, 1.0, -1.0), 0.0)
     second = jnp.where((offset >= 0.0) & (offset < 2.0), jnp.where(offset < 1.0, 1.0, -1.0), 0.0)

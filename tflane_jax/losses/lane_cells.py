@@ -27,10 +27,10 @@ class LaneCells(NamedTuple):
     """Targets of the cells.
 
     Attributes:
-        inside: of some straight piece of a lane, the point nearest to the cell's centre lies in the cell. A lane that
+        inside: of some straight piece of a lane, the point nearest to the cell's center lies in the cell. A lane that
             only cuts a corner may not count.
-        near: a lane passes within 1.5 cells of the cell's centre.
-        offset: from the centre to the nearest point of a lane, in cells along x and y; 0 unless `near`.
+        near: a lane passes within 1.5 cells of the cell's center.
+        offset: from the center to the nearest point of a lane, in cells along x and y; 0 unless `near`.
         direction: unit direction of that lane; 0 unless `near`.
     """
 

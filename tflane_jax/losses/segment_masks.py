@@ -13,7 +13,7 @@ from tflane_jax.geometry import PerceptionRange
 _PUBLISHED_BOX = (100.0, 50.0)
 
 Raster = Literal["cells", "published"]
-"""Which cells belong to a polygon. "cells": those whose centre lies inside. "published": those that OpenCV's fillPoly
+"""Which cells belong to a polygon. "cells": those whose center lies inside. "published": those that OpenCV's fillPoly
 fills, border included, with vertices truncated to whole cells of a box of 100 m x 50 m in place of the grid's own."""
 
 
@@ -36,7 +36,7 @@ def segment_masks(
     ring = jnp.concatenate([left, right[:, ::-1]], 1)[..., :2]
     size = jnp.asarray((w, h), ring.dtype)[None, None]
     if raster == "cells":
-        # Cell centres at integers.
+        # Cell centers at integers.
         ring = range_.normalise(ring) * size - 0.5
     else:
         ring = jnp.trunc(ring * (size / jnp.asarray(_PUBLISHED_BOX)[None, None]) + size / 2.0)

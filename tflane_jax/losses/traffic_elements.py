@@ -1,6 +1,6 @@
 """Losses of traffic elements in the front view: Deformable DETR's, as TopoNet uses them (docs/reference/toponet.md).
 
-Per decoder layer: focal loss on the class, L1 on centre and size as fractions of the image, and generalised IoU.
+Per decoder layer: focal loss on the class, L1 on center and size as fractions of the image, and generalised IoU.
 """
 
 from __future__ import annotations
@@ -137,7 +137,7 @@ def element_terms(
 
 
 def _fractions(box: Float[Array, "*b 2 2"], size: Int[Array, " 2"]) -> Float[Array, "*b 4"]:
-    """Return centre and size of boxes as fractions of the image."""
+    """Return center and size of boxes as fractions of the image."""
     unit = jnp.maximum(size.astype(box.dtype), 1.0).reshape((1,) * (box.ndim - 2) + (2,))
     low, high = box[..., 0, :], box[..., 1, :]
     return jnp.concatenate([0.5 * (low + high) / unit, (high - low) / unit], -1)

@@ -101,7 +101,7 @@ def find_markers(
     found: list[_Reading] = []
     for width in _WINDOWS:
         outlines, ids, _ = _detector(cv2, max(grey.shape), config, width).detectMarkers(grey)
-        # OpenCV has its origin at the centre of the first pixel, this package at its corner.
+        # OpenCV has its origin at the center of the first pixel, this package at its corner.
         squares = np.asarray(outlines, np.float64).reshape(-1, 4, 2) + 0.5
         for marker_id, corners in zip([] if ids is None else np.ravel(ids).tolist(), squares, strict=True):
             cells = marker_cells(config.family, marker_id)

@@ -34,7 +34,7 @@ class MarkerSimulationConfig:
     Attributes:
         forward_sigma: standard deviation of the error along the ego x axis at `reference`, metres (paper: 3 m at 60 m).
         yaw_sigma, pitch_sigma: of the orientation at `reference`, degrees (paper: 2 degrees at 60 m). The marker
-            rotates about its own centre.
+            rotates about its own center.
         reference: distance to which the three values refer, metres.
         growth: how all three grow with the distance from 0: "linear" or "quadratic". The paper states only that they
             grow; the error of a depth estimated from the marker's size in pixels grows with the square.
@@ -227,7 +227,7 @@ def _perturbed(
     drawn: _Draws,
     config: MarkerSimulationConfig,
 ) -> Float[np.ndarray, "m 4 4"]:
-    """Return poses with the errors of section IV-A: shift along x, jump, and rotation about the marker's centre."""
+    """Return poses with the errors of section IV-A: shift along x, jump, and rotation about the marker's center."""
     growth = config.growth_at(distance)
     forward, yaw, pitch, further, turned = drawn.normal.T
     yaw, pitch = growth * config.yaw_sigma * yaw, growth * config.pitch_sigma * pitch

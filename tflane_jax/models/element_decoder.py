@@ -130,7 +130,7 @@ class ElementDecoder(nn.Module):
                 for i, mask in enumerate(masks)
             ]
         )
-        cells = jnp.concatenate([cell_centres(shape, ratio) for shape, ratio in zip(shapes, ratios, strict=True)])
+        cells = jnp.concatenate([cell_centers(shape, ratio) for shape, ratio in zip(shapes, ratios, strict=True)])
         around = cells[:, None, None] * ratios[None, None]  # (T, 1, L, 2): the same point on every level
         for i in range(config.encoder_layers):
             layer, given = partial(ElementEncoderLayer, config, name=f"encoder_{i}"), (tokens, position, around, valid)
@@ -244,8 +244,8 @@ def valid_ratio(mask: Bool[Array, "h w"]) -> Float[Array, " 2"]:
     return jnp.maximum(jnp.stack([columns, rows]), jnp.array([1.0 / w, 1.0 / h]))
 
 
-def cell_centres(shape: tuple[int, int], ratio: Float[Array, " 2"]) -> Float[Array, "hw 2"]:
-    """Return the centre (x, y) of every cell, row-major, as fractions of the part that shows the image."""
+def cell_centers(shape: tuple[int, int], ratio: Float[Array, " 2"]) -> Float[Array, "hw 2"]:
+    """Return the center (x, y) of every cell, row-major, as fractions of the part that shows the image."""
     h, w = shape
     y, x = np.meshgrid((np.arange(h) + 0.5) / h, (np.arange(w) + 0.5) / w, indexing="ij")
     return jnp.asarray(np.stack([x, y], -1).reshape(-1, 2), jnp.float32) / ratio[None]
@@ -253,8 +253,8 @@ def cell_centres(shape: tuple[int, int], ratio: Float[Array, " 2"]) -> Float[Arr
 
 def corners(box: Float[Array, "e 4"], size: Int[Array, " 2"]) -> Float[Array, "e 2 2"]:
     """Return top-left and bottom-right corners, pixels, of boxes (cx, cy, w, h), fractions of the image `size`."""
-    centre, half = box[:, :2], 0.5 * box[:, 2:]
-    return jnp.stack([centre - half, centre + half], 1) * size.astype(box.dtype)[None, None]
+    center, half = box[:, :2], 0.5 * box[:, 2:]
+    return jnp.stack([center - half, center + half], 1) * size.astype(box.dtype)[None, None]
 
 
 def _sizes(config: ElementDecoderConfig) -> TransformerConfig:

@@ -91,7 +91,7 @@ class LaneProposals(nn.Module):
         return LaneStart(content, position, reference)
 
     def _centers(self, h: int, w: int) -> Float[np.ndarray, "q 2"]:
-        """Return the centres of all cells, metres."""
+        """Return the centers of all cells, metres."""
         return np.asarray(self.range.denormalise(cell_points(BevGrid(rows=h, columns=w))))
 
 

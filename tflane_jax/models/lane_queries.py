@@ -142,7 +142,7 @@ class LaneQueries(nn.Module):
 def spread_lanes(count: int, points: int, range_: PerceptionRange, length: float = 24.0) -> Float[np.ndarray, "q p 3"]:
     """Return the initial anchors: `count` straight lanes spread evenly over the range, in [0, 1].
 
-    Centres and headings follow a Halton sequence: 30 percent head along the ego's x axis, 30 percent against it, 40
+    Centers and headings follow a Halton sequence: 30 percent head along the ego's x axis, 30 percent against it, 40
     percent in any direction. `length` is in metres.
     """
     sample = np.stack([_radical_inverse(np.arange(1, count + 1), base) for base in (2, 3, 5)], -1)

@@ -1,6 +1,6 @@
 """Parts of LaneSegNet's decoder (Li et al. 2024): attention regions and the heads of lane segments.
 
-A lane segment is a centerline and an offset: left = centre + offset, right = centre - offset. Each attention head
+A lane segment is a centerline and an offset: left = center + offset, right = center - offset. Each attention head
 samples around a point of its own on the two boundaries that the layer before predicted ("heads-to-regions").
 """
 

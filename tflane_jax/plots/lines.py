@@ -22,11 +22,11 @@ def turned(shapes: Float[np.ndarray, "#k n 2"], angle: Float[np.ndarray, " k"]) 
 
 
 def box_corners(
-    centre: Float[np.ndarray, "k 2"], yaw: Float[np.ndarray, " k"], size: Float[np.ndarray, "k 2"]
+    center: Float[np.ndarray, "k 2"], yaw: Float[np.ndarray, " k"], size: Float[np.ndarray, "k 2"]
 ) -> Float[np.ndarray, "k 4 2"]:
     """Return the corners of boxes of (length, width) turned by `yaw`, counter-clockwise from front left."""
     corners = np.asarray([[0.5, 0.5], [-0.5, 0.5], [-0.5, -0.5], [0.5, -0.5]]) * size[:, None]
-    return turned(corners, yaw) + centre[:, None]
+    return turned(corners, yaw) + center[:, None]
 
 
 def valid_rows(valid: ArrayLike, *arrays: ArrayLike) -> list[np.ndarray]:

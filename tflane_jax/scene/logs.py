@@ -49,7 +49,7 @@ class MapElement:
     """A traffic light or sign.
 
     Attributes:
-        position: (3,) centre, global metres.
+        position: (3,) center, global metres.
         yaw: direction of its front, global radians.
         category: 1 traffic light, 2 road sign.
         attribute: OpenLane-V2 attribute; of a light, its initial state.
@@ -73,7 +73,7 @@ class VectorMap:
         road_boundaries: polylines (n, 3); a closed ring repeats its first point.
         elements: traffic lights and signs.
         buildings: (B, 5) x, y, length, width, yaw of opaque blocks of unlimited height.
-        roads: centre line (n, 3) of each road; empty if the source has no roads. A closed one repeats its first point.
+        roads: center line (n, 3) of each road; empty if the source has no roads. A closed one repeats its first point.
         dividers: painted dividers (n, 3) where the source records them on their own; None if it records only the sides
             of lanes.
         side: on which traffic keeps, if the source says so; see `world.roads.road_map.driving_side`.
@@ -94,7 +94,7 @@ class Tracks:
     """Boxes of K road users over F frames; **each frame's boxes in the ego frame of that frame**.
 
     Attributes:
-        position: (F, K, 3) box centres, metres.
+        position: (F, K, 3) box centers, metres.
         yaw: (F, K) radians.
         size: (K, 3) length, width, height, metres.
         category: (K,) `scene.RoadUser`.

@@ -43,7 +43,7 @@ class TrafficFlow:
     the current frame.
 
     Attributes:
-        position: (K, N, 3) box centres, metres, current ego frame.
+        position: (K, N, 3) box centers, metres, current ego frame.
         yaw: (K, N) heading in the current ego frame, radians.
         size: (K, 3) length, width, height, metres.
         category: (K,) `RoadUser`.

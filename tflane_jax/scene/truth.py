@@ -162,7 +162,7 @@ class TrafficElements:
     """Traffic lights and signs.
 
     Attributes:
-        position: (E, 3) centre in the ego frame, metres.
+        position: (E, 3) center in the ego frame, metres.
         box: (E, 2, 2) top-left and bottom-right pixel corners in the front image; zeros without an image.
         category: (E,) 1 traffic light, 2 road sign.
         attribute: (E,) OpenLane-V2 attribute 0 to 12.

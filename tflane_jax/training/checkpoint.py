@@ -160,20 +160,20 @@ class Checkpoints:
 
         Args:
             step: which checkpoint.
-            template: a state (or the shapes of one) of the same task, optimiser and seeds.
+            template: a state (or the shapes of one) of the same task, optimizer and seeds.
 
         Raises:
-            UserError: the checkpoint is damaged, or belongs to another model or optimiser.
+            UserError: the checkpoint is damaged, or belongs to another model or optimizer.
         """
         saved, shapes = _with_current_names(self.arrays(step)), jax.eval_shape(_plain_tree, template)
         expected = serialization.to_state_dict(shapes)
         if (difference := _first_difference(saved, flat(expected))) is not None:
             raise UserError(
                 f"checkpoint {self.path(step)} does not fit this configuration: {difference}. It was made by another "
-                "model, optimiser or number of seeds: undo the change of config.json (config.txt has the settings "
+                "model, optimizer or number of seeds: undo the change of config.json (config.txt has the settings "
                 "that the run was started with), or train another run"
             )
-        # Through the template's own dict, because empty parts of an optimiser's state are not stored.
+        # Through the template's own dict, because empty parts of an optimizer's state are not stored.
         leaves = jax.tree_util.tree_map_with_path(
             lambda path, _: saved["/".join(entry.key for entry in path)], expected
         )

@@ -58,7 +58,7 @@ def not_finite(
     data = f"Numbers of its examples are not finite either: {fields}; see whether valid ones are. " if fields else ""
     if step == 0:
         advice = (
-            "No update has been made, so the optimiser's settings are not the cause: look at the first examples, the "
+            "No update has been made, so the optimizer's settings are not the cause: look at the first examples, the "
             "parameters that the run starts from, and the settings of model and losses"
         )
     else:

@@ -1,4 +1,4 @@
-"""Cosine annealing with warm restarts (SGDR; GTN paper, section 2.2, Eq. 2) as a state that the optimiser carries.
+"""Cosine annealing with warm restarts (SGDR; GTN paper, section 2.2, Eq. 2) as a state that the optimizer carries.
 
 Eq. (2) as printed has the peak rate on its left and closes the cosine's parenthesis before pi. The text around it
 describes the SGDR paper's formula, which is used here:
@@ -150,13 +150,13 @@ def _is_cycle(node: Any) -> bool:
 
 
 def cycle_of(opt_state: Any) -> Cycle:
-    """Return the cycle in the state of an optimiser that restarts."""
+    """Return the cycle in the state of an optimizer that restarts."""
     (cycle,) = filter(_is_cycle, jax.tree.leaves(opt_state, is_leaf=_is_cycle))
     return cycle
 
 
 def with_cycle(opt_state: Any, cycle: Cycle) -> Any:
-    """Return an optimiser's state with another cycle (numpy) in it."""
+    """Return an optimizer's state with another cycle (numpy) in it."""
     new = jax.tree.map(jnp.asarray, cycle)
     return jax.tree.map(lambda node: new if _is_cycle(node) else node, opt_state, is_leaf=_is_cycle)
 
@@ -176,12 +176,12 @@ def adapt(
 
     Args:
         config: with `adaptive`.
-        opt_state: of the optimiser, with a leading seed axis where there are several seeds.
+        opt_state: of the optimizer, with a leading seed axis where there are several seeds.
         memories, evaluations: one per seed; an evaluation without the rule's metric is no improvement.
         steps: of the run.
 
     Returns:
-        The optimiser's new state (same shapes and types: no compilation), the new memories, and the cycles as they
+        The optimizer's new state (same shapes and types: no compilation), the new memories, and the cycles as they
         are now, for the record: `number`, `length`, `magnitude` and `extensions`, one value per seed.
     """
     adaptive = config.adaptive

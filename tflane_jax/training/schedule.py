@@ -60,7 +60,7 @@ class DropsConfig:
 
 @dataclass(frozen=True)
 class OptimConfig:
-    """Optimiser and averaging.
+    """Optimizer and averaging.
 
     Attributes:
         lr: peak learning rate; of a batch of `reference_batch` examples if `lr_scaling` is not "none". 0 changes
@@ -129,7 +129,7 @@ class OptimConfig:
 
 
 Rate = Callable[[Any, Int[ArrayLike, ""]], Float[Array, ""]]
-"""(the optimiser's state, the number of updates made) -> learning rate of the next update."""
+"""(the optimizer's state, the number of updates made) -> learning rate of the next update."""
 
 
 def scaled_to_batch(config: OptimConfig, batch_size: int) -> OptimConfig:
@@ -161,7 +161,7 @@ def make_schedule(config: OptimConfig, steps: int) -> optax.Schedule:
     """
     _check(config, steps)
     if config.restarts is not None:
-        raise ValueError("with restarts the learning rate depends on the optimiser's state, not on the step alone")
+        raise ValueError("with restarts the learning rate depends on the optimizer's state, not on the step alone")
     if (drops := config.drops) is not None:
 
         def by_drops(step: Int[ArrayLike, "..."]) -> Float[Array, "..."]:
@@ -245,7 +245,7 @@ def _clip_by_norm(largest: float) -> optax.GradientTransformation:
 def _decay_trained_leaves(rate: float) -> optax.GradientTransformation:
     """Add `rate` times the parameters, except to leaves whose update is zero everywhere.
 
-    These are the frozen parts of a backbone, which PyTorch does not pass to the optimiser at all.
+    These are the frozen parts of a backbone, which PyTorch does not pass to the optimizer at all.
     """
 
     def update(updates: Any, state: Any, params: Any = None) -> tuple[Any, Any]:

@@ -28,7 +28,7 @@ class TrainState:
         learned: the parameters that have a gradient.
         statistics: running statistics of batch norms, see `models.parameters`.
         ema_learned, ema_statistics: exponential moving averages of both.
-        opt_state: of the optimiser; its moments are `Vectors` too.
+        opt_state: of the optimizer; its moments are `Vectors` too.
         key: () root key of the run; it never changes, random streams are derived from it by name and step.
     """
 
@@ -126,7 +126,7 @@ def tree_of(state: TrainState) -> dict[str, Any]:
 
 
 def state_from(trees: dict[str, Any], like: TrainState) -> TrainState:
-    """Return the state of given trees; `like` is a state of the same task and optimiser."""
+    """Return the state of given trees; `like` is a state of the same task and optimizer."""
     learned, statistics = split_statistics(trees["params"])
     ema_learned, ema_statistics = split_statistics(trees["ema_params"])
     return TrainState(

@@ -1,4 +1,4 @@
-"""The update step: loss, gradient, optimiser, moving average. It is traced once.
+"""The update step: loss, gradient, optimizer, moving average. It is traced once.
 
 A batch may pass through the model in parts, one after the other, so that only the activations of one part are held at a
 time. Loss and gradient are then means over the parts. This equals the whole batch for what is a mean over examples;

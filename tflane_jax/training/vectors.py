@@ -95,7 +95,7 @@ class Vectors:
     Attributes:
         groups: group -> (..., n) numbers of its leaves. The groups are "dense" and "convolution" (kernels), "other"
             (further matrices) and "plain" (what has no weight decay: biases and norms). A group without leaves is
-            absent; in the state of an optimiser for other groups it is an `optax.MaskedNode`.
+            absent; in the state of an optimizer for other groups it is an `optax.MaskedNode`.
         layout: where each leaf lies.
     """
 

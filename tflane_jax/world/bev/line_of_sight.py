@@ -61,7 +61,7 @@ def hidden_points(
 
     Args:
         points: x, y in the ego frame, metres.
-        boxes: rows x, y, length, width, yaw, height, base_z (centre in x and y; base_z is the underside).
+        boxes: rows x, y, length, width, yaw, height, base_z (center in x and y; base_z is the underside).
         buildings: rows x, y, length, width, yaw; opaque from the ground to any height.
         sensor_height: metres above the ground.
         target_height: height of the points, a scalar or one value per point.

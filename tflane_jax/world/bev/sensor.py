@@ -65,7 +65,7 @@ class BevSensorConfig:
 def hidden_cells(
     grid: BevGrid, boxes: Float[np.ndarray, "k 7"], buildings: Float[np.ndarray, "b 5"]
 ) -> Bool[np.ndarray, "h w"]:
-    """Return the cells whose centre on the ground the sensor cannot see (see `hidden_points`)."""
+    """Return the cells whose center on the ground the sensor cannot see (see `hidden_points`)."""
     lattice = _lattice(grid)
     hidden = hidden_points(lattice.centres, boxes, buildings, directions=lattice.directions)
     return hidden.reshape(grid.rows, grid.columns)
@@ -121,7 +121,7 @@ def render_bev(
 
 @dataclass(frozen=True)
 class _Lattice:
-    """A grid with values that every frame needs: cell centres (H W, 2), their directions and range (H, W), metres."""
+    """A grid with values that every frame needs: cell centers (H W, 2), their directions and range (H, W), metres."""
 
     grid: BevGrid
     centres: np.ndarray

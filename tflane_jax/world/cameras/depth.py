@@ -85,7 +85,7 @@ def _add_bodies(inverse: Float[np.ndarray, "h w"], bodies: Bodies, camera: Pinho
         plane = plane / -faces.towards[number]
         u, v = np.arange(left, right) + 0.5, np.arange(top, bottom) + 0.5
         near = plane[0] * u + (plane[1] * v)[:, None] + plane[2]
-        # cv2 fills the pixels of the border too, whose centres lie outside.
+        # cv2 fills the pixels of the border too, whose centers lie outside.
         near = np.clip(near, 1.0 / distance.max(), 1.0 / max(distance.min(), NEAR))
         window = inverse[top:bottom, left:right]
         np.maximum(window, np.where(covered > 0, near, 0.0), out=window)

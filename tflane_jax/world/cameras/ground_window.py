@@ -33,7 +33,7 @@ class Window:
     rows: int
 
     def fixed(self, points: Float[np.ndarray, "*n 2"]) -> Int[np.ndarray, "*n 2"]:
-        """Convert points to cv2's fixed point: 1/16 texel from the first texel's centre."""
+        """Convert points to cv2's fixed point: 1/16 texel from the first texel's center."""
         return np.round(((points - np.array(self.low)) / self.texel - 0.5) * (1 << SHIFT)).astype(np.int32)
 
     def meets(self, corners: Float[np.ndarray, "n k 2"]) -> Bool[np.ndarray, " n"]:

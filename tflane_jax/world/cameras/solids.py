@@ -1,6 +1,6 @@
 """Convex bodies made of flat polygons, packed into arrays and drawn from far to near.
 
-Distance does not decide which of two bodies hides the other: the centre of a long building beside the road may be
+Distance does not decide which of two bodies hides the other: the center of a long building beside the road may be
 nearer than a car in front of it. A separating plane does: bodies on the camera's side of it are never hidden by those
 beyond (Schumacker et al. 1969). Every body has an upright bounding box; the faces of these boxes are the candidate
 planes.
@@ -43,7 +43,7 @@ class Bodies:
         colours: (K, 3) display values 0 to 1.
         light: (K,) 0 lit by the sun, 1 shines by itself.
         owner: (K,) body of each polygon; polygons of one body lie in the order in which they are drawn.
-        blobs: (L, 4) centre and radius, metres.
+        blobs: (L, 4) center and radius, metres.
         blob_colours: (L, 3).
         blob_owner: (L,).
         pictures: (r, c) patterns by polygon index, top row first: 1 has the polygon's colour, 0 is black. Such a

@@ -24,7 +24,7 @@ class Ground:
 
     Attributes:
         first_row: image row of row 0 of the arrays.
-        s, offset: (h, w) station and offset of the road at each pixel's centre, metres.
+        s, offset: (h, w) station and offset of the road at each pixel's center, metres.
         depth: (h, w) along the optical axis, metres; `_BEYOND` where a pixel shows no ground.
         length: (h,) metres of road that a row covers.
     """

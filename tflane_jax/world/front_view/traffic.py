@@ -39,7 +39,7 @@ class FrontTraffic:
     """Vehicles on the ground of the ego frame.
 
     Attributes:
-        xy: (k, 2) centres, metres.
+        xy: (k, 2) centers, metres.
         yaw: (k,) radians.
         size: (k, 3) length, width, height, metres.
         category: (k,) `RoadUser`.

@@ -80,7 +80,7 @@ def draw_solids(
 
 
 def fixed_point(pixels: Float[np.ndarray, "m 2"]) -> Int[np.ndarray, "m 2"]:
-    """Convert pixels, counted from the image corner, to cv2's fixed point: 1/16 pixel from the first pixel's centre."""
+    """Convert pixels, counted from the image corner, to cv2's fixed point: 1/16 pixel from the first pixel's center."""
     return np.round((np.clip(pixels, -_LIMIT, _LIMIT) - 0.5) * (1 << SHIFT)).astype(np.int32)
 
 

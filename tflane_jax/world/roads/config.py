@@ -82,8 +82,8 @@ class RoadConfig:
         fast_taper: length over which a lane opens or closes on fast roads.
         pocket: length of a turning lane, taper included.
         skew: largest deviation of the arms of an intersection from the right angle.
-        arm_offset: largest sideways shift of an arm from the intersection's centre.
-        junction_distance: distance between the centres of two junctions.
+        arm_offset: largest sideways shift of an arm from the intersection's center.
+        junction_distance: distance between the centers of two junctions.
         side_lean: largest deviation of their side streets, and of those of staggered junctions, from the right angle;
             they also bend by less than this. Much of it lets streets on one side meet, if the junctions are near.
         stagger: distance between the two side streets of a staggered junction, along its main road; a little more where

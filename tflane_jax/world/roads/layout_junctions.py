@@ -48,7 +48,7 @@ class JunctionPlan:
         arms: streets that end at the border of the map, in any order.
         corner_radius: metres.
         signalised: has traffic lights.
-        nodes: where the centre lines of its streets meet, if not at the centre.
+        nodes: where the center lines of its streets meet, if not at the center.
     """
 
     center: Float[np.ndarray, "2"]

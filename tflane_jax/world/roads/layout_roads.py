@@ -11,7 +11,7 @@ from tflane_jax.world.roads.cross_sections import ExtraLane, Place, SidePlan
 from tflane_jax.world.roads.layouts import StreetStyle, centred, chance, draw, draw_style, left_pocket
 from tflane_jax.world.roads.streets import StreetPlan
 
-# Roads extend beyond the map by this much, because bends bring their ends nearer to its centre, metres.
+# Roads extend beyond the map by this much, because bends bring their ends nearer to its center, metres.
 _BEYOND = 14.0
 _LONGEST_ARC = 90.0
 

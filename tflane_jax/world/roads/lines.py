@@ -1,4 +1,4 @@
-"""Road centre lines without lanes, the input of the SD map."""
+"""Road center lines without lanes, the input of the SD map."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tflane_jax.world.roads.streets import Street
 def road_lines(streets: Sequence[Street], plan: JunctionsPlan | None = None) -> tuple[Float[np.ndarray, "n 2"], ...]:
     """Return one line for each street, midway between its kerbs (in the median where it has one), metres.
 
-    Streets that meet at an intersection all end at its centre, or at the nearest of its nodes, which a line of their
+    Streets that meet at an intersection all end at its center, or at the nearest of its nodes, which a line of their
     own joins. At a roundabout they end on its circulating lane, which is a closed line and comes last.
 
     Args:

@@ -54,7 +54,7 @@ class PreparedRoads:
         kerbs: parts of them beside lanes; sidewalks: lines behind them on which pedestrians walk.
         walks: start and end of the walk over each crossing; crossings: their rings.
         parking: x, y, yaw.
-        roads: centre lines.
+        roads: center lines.
         points: of all lanes.
         complete: distance from the places up to which every lane is in the map, metres.
         beside: distance from the nearest place, lane, station and point, every few metres of lane.

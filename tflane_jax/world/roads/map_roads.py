@@ -1,4 +1,4 @@
-"""Road centre lines of a recorded map, the input of the SD map: one for each bundle of lanes side by side."""
+"""Road center lines of a recorded map, the input of the SD map: one for each bundle of lanes side by side."""
 
 from __future__ import annotations
 

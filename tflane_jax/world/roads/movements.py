@@ -261,7 +261,7 @@ def _largest_radius(m: Movement, approaches: Sequence[Approach], corner_radius: 
     clear = min(to_kerb, 0.5 * max(m.source.width, m.sink.width) + _KERB_CLEARANCE)
     half_gap = 0.5 * (np.pi - abs(float(wrap_angle(m.sink.heading - m.source.heading))))
     # The rounding's circle must lie inside the turn's with `clear` to spare; both touch the sides of the corner, so
-    # that their centres are (radius - corner_radius - to_kerb) / sin(half_gap) apart.
+    # that their centers are (radius - corner_radius - to_kerb) / sin(half_gap) apart.
     slope = 1.0 / np.sin(half_gap)
     return float(((corner_radius + to_kerb) * slope - corner_radius - clear) / max(slope - 1.0, 1e-6))
 

@@ -173,7 +173,7 @@ def _distance(
 
 
 def crossing_line(ring: Float[np.ndarray, "5 2"]) -> Float[np.ndarray, "2 2"]:
-    """Return the centre line of a pedestrian crossing of the built-in world, from kerb to kerb."""
+    """Return the center line of a pedestrian crossing of the built-in world, from kerb to kerb."""
     return np.stack([0.5 * (ring[0] + ring[3]), 0.5 * (ring[1] + ring[2])])
 
 

@@ -80,7 +80,7 @@ class Traffic:
     """N road users over F frames, global metres and radians.
 
     Attributes:
-        xy: (F, N, 2) box centres.
+        xy: (F, N, 2) box centers.
         yaw: (F, N).
         present: (F, N).
         size: (N, 3) length, width, height.
@@ -229,7 +229,7 @@ def _ego_starts(
 
 @dataclass(frozen=True)
 class _Driven:
-    """Vehicles of N trips over F frames: box centres, headings, presence, sizes and categories."""
+    """Vehicles of N trips over F frames: box centers, headings, presence, sizes and categories."""
 
     xy: Float[np.ndarray, "f n 2"]
     yaw: Float[np.ndarray, "f n"]

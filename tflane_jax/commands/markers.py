@@ -30,7 +30,7 @@ from tflane_jax.commands.sources import make_folder
 from tflane_jax.datasets.plausible import LARGEST_DISTORTION, MOST_PIXELS
 from tflane_jax.errors import LeftOutWarning, UserError
 from tflane_jax.files.atomic import check_folder, check_replaces, delete_older, write_bytes, write_json
-from tflane_jax.files.images import check_centre, list_photos, opencv, read_image, undistorted
+from tflane_jax.files.images import check_center, list_photos, opencv, read_image, undistorted
 from tflane_jax.files.wording import check_name, counted, plain_name, short_stem
 from tflane_jax.geometry.cameras import project
 from tflane_jax.limits import check_settings
@@ -96,7 +96,7 @@ def find(options: argparse.Namespace) -> int:
         try:
             check_name(path)
             photo = read_image(path)
-            check_centre(path, photo, intrinsics)
+            check_center(path, photo, intrinsics)
             photo = undistorted(path, photo, intrinsics, distortion)
             found = detect(_views(photo, intrinsics, pose), config)
             _write_picture(options.out / picture, photo, found, config.size, config.family, intrinsics, pose)

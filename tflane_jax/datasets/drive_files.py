@@ -28,7 +28,7 @@ from tflane_jax.datasets.plausible import LARGEST_DISTORTION, LARGEST_IMAGE, che
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import write_json
 from tflane_jax.files.fields import file_within, items, load_json, member, numbers, whole_number
-from tflane_jax.files.images import check_centre, read_image, undistorted
+from tflane_jax.files.images import check_center, read_image, undistorted
 from tflane_jax.files.wording import shown
 from tflane_jax.geometry import invert_pose
 from tflane_jax.scene import CameraViews
@@ -128,14 +128,14 @@ class Drive:
             for frame in self.frames:
                 with contextlib.suppress(KeyError, UserError):
                     image = read_image(path := frame.images[camera.name])
-                    check_centre(path, image, camera.intrinsics)
+                    check_center(path, image, camera.intrinsics)
                     self._sizes[camera.name] = (image.shape[1], image.shape[0])
                     break
         return self._sizes[camera.name]
 
     def _check_size(self, camera: DriveCamera, path: Path, image: UInt8[np.ndarray, "h w 3"]) -> None:
         if camera.size is None:
-            check_centre(path, image, camera.intrinsics)
+            check_center(path, image, camera.intrinsics)
         height, width = image.shape[:2]
         if (size := self._size(camera)) is not None and size != (width, height):
             others = "the calibration" if camera.size is not None else "the first image"

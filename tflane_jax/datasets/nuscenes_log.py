@@ -233,9 +233,9 @@ def scene_tracks(
     tracks.size[:] = size[first][:, [1, 0, 2]]  # the table has width, length, height
     tracks.category[:] = [_category(tables, rows[i], categories) for i in first]
     global_from_ego, frame_from_ego = frames.global_from_ego[f], frames.frame_from_ego[f]
-    ego_centre = transform_points(invert_pose(global_from_ego), pose[:, None, :3, 3])
-    check_distance(ego_centre[:, 0], where)
-    tracks.position[f, k] = transform_points(frame_from_ego, ego_centre)[:, 0]
+    ego_center = transform_points(invert_pose(global_from_ego), pose[:, None, :3, 3])
+    check_distance(ego_center[:, 0], where)
+    tracks.position[f, k] = transform_points(frame_from_ego, ego_center)[:, 0]
     yaw = pose_yaw(pose) - pose_yaw(global_from_ego) + pose_yaw(frame_from_ego)
     tracks.yaw[f, k] = wrap_angle(yaw)
     tracks.occluded[f, k] = _unseen(tables, rows, where, least_visibility)

@@ -140,9 +140,9 @@ def check_headings(
     Rotations in another order, direction or unit, or axes that are swapped, would turn the lanes that traffic flow
     tells of. Some vehicles reverse; with fewer than three that move, nothing is said.
     """
-    centre = transform_points(global_from_frame, tracks.position)[..., :2]
+    center = transform_points(global_from_frame, tracks.position)[..., :2]
     heading = tracks.yaw + pose_yaw(global_from_frame)[:, None]
-    step, seconds = np.diff(centre, axis=0), np.diff(times_ns)[:, None] / 1e9
+    step, seconds = np.diff(center, axis=0), np.diff(times_ns)[:, None] / 1e9
     vehicle = np.isin(tracks.category, (RoadUser.CAR, RoadUser.TRUCK, RoadUser.BUS))
     moving = tracks.valid[1:] & tracks.valid[:-1] & vehicle & (np.linalg.norm(step, axis=-1) > _MOVING * seconds)
     apart = np.abs(wrap_angle(heading[:-1] - np.arctan2(step[..., 1], step[..., 0])))

@@ -138,7 +138,7 @@ def read_image(path: Path) -> UInt8[np.ndarray, "h w 3"]:
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
-def check_centre(path: Path, image: UInt8[np.ndarray, "h w 3"], intrinsics: Float[np.ndarray, "3 3"]) -> None:
+def check_center(path: Path, image: UInt8[np.ndarray, "h w 3"], intrinsics: Float[np.ndarray, "3 3"]) -> None:
     """Raise UserError if the principal point shows that an image has another size than the calibration.
 
     It is outside of the image, or off its center in both directions alike, as cropping alone seldom leaves it.

@@ -167,11 +167,11 @@ def store_of(
 def _local_graph(
     lanes: Mapping[int, LaneSegment], pose: Float[np.ndarray, "4 4"], radius: float, points: int
 ) -> tuple[Float[np.ndarray, "j p 3"], Bool[np.ndarray, "j j"]]:
-    centre, pieces = pose[:2, 3], []
+    center, pieces = pose[:2, 3], []
     for number, lane in lanes.items():
         low, high = lane.centerline[:, :2].min(0), lane.centerline[:, :2].max(0)
-        if (low <= centre + radius).all() and (high >= centre - radius).all():
-            parts = _clip_to_circle(lane.centerline, centre, radius)
+        if (low <= center + radius).all() and (high >= center - radius).all():
+            parts = _clip_to_circle(lane.centerline, center, radius)
             pieces += [(number, part, i == 0, i == len(parts) - 1) for i, part in enumerate(parts)]
     whole = [lanes[number].centerline for number, *_ in pieces]
     ends = np.array(
@@ -187,11 +187,11 @@ def _local_graph(
 
 
 def _clip_to_circle(
-    points: Float[np.ndarray, "n 3"], centre: Float[np.ndarray, "2"], radius: float
+    points: Float[np.ndarray, "n 3"], center: Float[np.ndarray, "2"], radius: float
 ) -> list[Float[np.ndarray, "k 3"]]:
     """Return the pieces of a line inside a circle of the ground plane, in order along the line."""
     a, step = points[:-1], np.diff(points, axis=0)
-    away = a[:, :2] - centre
+    away = a[:, :2] - center
     square, dot, beyond = (step[:, :2] ** 2).sum(-1), (away * step[:, :2]).sum(-1), (away**2).sum(-1) - radius**2
     # Solve |away + t step| = radius; a step of length 0 is inside if its start is.
     root = dot**2 - square * beyond

@@ -113,13 +113,13 @@ def _pairs_in_angle(points: Directions, occluders: np.ndarray) -> tuple[np.ndarr
     x, y, length, width, yaw = occluders[:, :5].T
     ahead = np.stack([np.cos(yaw), np.sin(yaw)], -1)
     left = np.stack([-ahead[:, 1], ahead[:, 0]], -1)
-    centre = np.stack([x, y], -1)
-    along, across = (centre * ahead).sum(-1), (centre * left).sum(-1)
+    center = np.stack([x, y], -1)
+    along, across = (center * ahead).sum(-1), (center * left).sum(-1)
     around_ego = (np.abs(along) < length / 2) & (np.abs(across) < width / 2)
 
     signs = np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]]) / 2
     corners = (
-        centre[:, None]
+        center[:, None]
         + (signs[:, :1] * length[:, None, None]) * ahead[:, None]
         + (signs[:, 1:] * width[:, None, None]) * left[:, None]
     )

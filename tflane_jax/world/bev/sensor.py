@@ -67,7 +67,7 @@ def hidden_cells(
 ) -> Bool[np.ndarray, "h w"]:
     """Return the cells whose center on the ground the sensor cannot see (see `hidden_points`)."""
     lattice = _lattice(grid)
-    hidden = hidden_points(lattice.centres, boxes, buildings, directions=lattice.directions)
+    hidden = hidden_points(lattice.centers, boxes, buildings, directions=lattice.directions)
     return hidden.reshape(grid.rows, grid.columns)
 
 
@@ -124,7 +124,7 @@ class _Lattice:
     """A grid with values that every frame needs: cell centers (H W, 2), their directions and range (H, W), metres."""
 
     grid: BevGrid
-    centres: np.ndarray
+    centers: np.ndarray
     directions: Directions
     range: np.ndarray
 
@@ -161,8 +161,8 @@ class _Lattice:
 @functools.lru_cache(maxsize=8)
 def _lattice(grid: BevGrid) -> _Lattice:
     x, y = np.meshgrid(*grid.centers())
-    centres = np.stack([x.ravel(), y.ravel()], -1)
-    return _Lattice(grid, centres, Directions.of(centres), np.hypot(x, y).astype(np.float32))
+    centers = np.stack([x.ravel(), y.ravel()], -1)
+    return _Lattice(grid, centers, Directions.of(centers), np.hypot(x, y).astype(np.float32))
 
 
 @functools.lru_cache(maxsize=32)

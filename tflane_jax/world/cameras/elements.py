@@ -110,11 +110,11 @@ def mast_bodies(elements: Sequence[MapElement], boundaries: Sequence[Float[np.nd
     solids: list[Solid] = []
     boxes: list[Box] = []
 
-    def add(centre: np.ndarray, heading: float, size: tuple[float, float], z: tuple[float, float]) -> None:
+    def add(center: np.ndarray, heading: float, size: tuple[float, float], z: tuple[float, float]) -> None:
         solid = Solid()
-        box(solid, centre, heading, size, z, _MAST)
+        box(solid, center, heading, size, z, _MAST)
         solids.append(solid)
-        boxes.append((centre[0], centre[1], *size, heading, *z))
+        boxes.append((center[0], center[1], *size, heading, *z))
 
     kerbs = np.concatenate([np.zeros((0, 2)), *(line[:, :2] for line in boundaries)])
     for element in elements:

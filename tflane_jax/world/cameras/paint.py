@@ -99,14 +99,14 @@ def _lines(vector_map: VectorMap, yellow: bool, paint_wear: float, log_seed: int
         normal = np.stack([-step[:, 1], step[:, 0]], -1) / length[:, None]
         key = line_key(line)
         # Inner boundary of two lanes: divides opposite directions. Inner boundary of one lane alone: a median's edge.
-        centre, edge = inner[key] == 2, inner[key] == 1 and shared[key] == 1
-        offsets = (-_DOUBLE, _DOUBLE) if centre and kind == LineType.SOLID else (0.0,)
+        center, edge = inner[key] == 2, inner[key] == 1 and shared[key] == 1
+        offsets = (-_DOUBLE, _DOUBLE) if center and kind == LineType.SOLID else (0.0,)
         for offset in offsets:
             middles.append(ends + offset * normal)
             widths.append(np.full(len(length), _WIDTH))
             lengths.append(length)
             normals.append(normal)
-            colours.append(np.tile(YELLOW if yellow and (centre or edge) else WHITE, (len(length), 1)))
+            colours.append(np.tile(YELLOW if yellow and (center or edge) else WHITE, (len(length), 1)))
             numbers.append(np.full(len(length), number))
             stations.append(0.5 * (start + stop))
     if not middles:

@@ -20,7 +20,7 @@ from tflane_jax.world.render.weather import FrontWeatherConfig
 ROOT = 20_251_121
 # Standard deviations at `jitter` 1: focal length and principal point (fractions of the focal length), position
 # (metres), angles (degrees).
-_FOCAL, _CENTRE, _PLACE, _ANGLE = 0.003, 0.004, 0.01, 0.35
+_FOCAL, _CENTER, _PLACE, _ANGLE = 0.003, 0.004, 0.01, 0.35
 # Images below this fraction of the native size are drawn twice as large and averaged.
 _SMALL = 0.35
 # Pixels: a frame of seven such images takes some gigabytes to draw.
@@ -138,9 +138,9 @@ def _draw_camera(seed: int, mount: CameraMount, config: CameraRigConfig) -> Pinh
     pose = camera_pose(0.0, angles[1], angles[0], angles[2])
     pose[:3, 3] = -pose[:3, :3] @ (np.array([mount.x, mount.y, mount.z]) + _PLACE * np.array([dx, dy, dz]))
     scale = [round(mount.width * config.scale) / mount.width, round(mount.height * config.scale) / mount.height]
-    centre = 0.5 * np.array([mount.width, mount.height]) + _CENTRE * mount.focal * np.array([u, v])
+    center = 0.5 * np.array([mount.width, mount.height]) + _CENTER * mount.focal * np.array([u, v])
     length = mount.focal * (1.0 + _FOCAL * focal)
-    native = np.array([[length, 0.0, centre[0]], [0.0, length, centre[1]], [0.0, 0.0, 1.0]])
+    native = np.array([[length, 0.0, center[0]], [0.0, length, center[1]], [0.0, 0.0, 1.0]])
     return PinholeCamera(*config.size(mount), np.diag([*scale, 1.0]) @ native, pose)
 
 

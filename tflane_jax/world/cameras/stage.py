@@ -186,8 +186,8 @@ def _static_light(
     lamps = None
     if weather.night:
         lamps = np.zeros_like(shade)
-        for centre in window.fixed(scenery.lamps).tolist():
-            cv2.circle(lamps, centre, round(9.0 / SHADE_TEXEL * (1 << SHIFT)), 130, -1, cv2.LINE_8, SHIFT)
-            cv2.circle(lamps, centre, round(4.5 / SHADE_TEXEL * (1 << SHIFT)), 230, -1, cv2.LINE_8, SHIFT)
+        for center in window.fixed(scenery.lamps).tolist():
+            cv2.circle(lamps, center, round(9.0 / SHADE_TEXEL * (1 << SHIFT)), 130, -1, cv2.LINE_8, SHIFT)
+            cv2.circle(lamps, center, round(4.5 / SHADE_TEXEL * (1 << SHIFT)), 230, -1, cv2.LINE_8, SHIFT)
         lamps = cv2.GaussianBlur(lamps, (0, 0), 2.5 / SHADE_TEXEL)
     return np.array(window.low), shade, lamps

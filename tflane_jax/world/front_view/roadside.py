@@ -100,13 +100,13 @@ def _rail(road: Highway, offset: float, hand: float) -> list[Solid]:
     return solids
 
 
-def _disc(centre: np.ndarray, radius: float, squash: float) -> np.ndarray:
+def _disc(center: np.ndarray, radius: float, squash: float) -> np.ndarray:
     """Return a disc that faces the camera."""
     angle = np.linspace(0.0, 2.0 * np.pi, 11)[:-1]
-    away = centre[:2] / max(float(np.hypot(*centre[:2])), 1e-6)
+    away = center[:2] / max(float(np.hypot(*center[:2])), 1e-6)
     right = np.array([away[1], -away[0], 0.0])
     up = np.array([0.0, 0.0, squash])
-    return centre + radius * (np.cos(angle)[:, None] * right + np.sin(angle)[:, None] * up)
+    return center + radius * (np.cos(angle)[:, None] * right + np.sin(angle)[:, None] * up)
 
 
 def _trees(rng: np.random.Generator, road: Highway, left: float, right: float) -> tuple[list[Solid], np.ndarray]:
@@ -169,9 +169,9 @@ def _signs(rng: np.random.Generator, road: Highway, right: float) -> list[Solid]
             box(solid, post, heading[0], (0.4, 0.4), (0.0, 7.2), _POST)
         box(solid, posts.mean(0), heading[0], (0.4, right_end - left_end), (6.4, 7.2), _POST)
         for fraction in rng.uniform(0.15, 0.85, rng.integers(1, 4)):
-            centre = posts[0] + fraction * (posts[1] - posts[0])
+            center = posts[0] + fraction * (posts[1] - posts[0])
             solid_sign = Solid(solid.distance - 1.0)
-            box(solid_sign, centre, heading[0], (0.2, rng.uniform(2.5, 5.0)), (5.6, 7.8), (0.05, 0.33, 0.2))
+            box(solid_sign, center, heading[0], (0.2, rng.uniform(2.5, 5.0)), (5.6, 7.8), (0.05, 0.33, 0.2))
             solids.append(solid_sign)
         solids.append(solid)
     return solids
@@ -205,10 +205,10 @@ def _bridge(
     low, high = rng.uniform(5.2, 6.0), rng.uniform(7.2, 8.5)
     _, heading = road.axis.at(np.array([station]))
     middle, reach = 0.5 * (left + right), 0.5 * (right - left) + 60.0
-    (centre,) = road.at(np.array([station]), np.array([middle]))
+    (center,) = road.at(np.array([station]), np.array([middle]))
     distance = station - half
     deck = Solid(distance)
-    box(deck, centre, heading[0], (2.0 * half, 2.0 * reach), (low, high), _CONCRETE)
+    box(deck, center, heading[0], (2.0 * half, 2.0 * reach), (low, high), _CONCRETE)
     solids = [deck]
     for offset in (left - 1.0, right + 2.0, road.left[1] - 0.6):
         if offset == road.left[1] - 0.6 and road.edges[1] >= road.edges[2]:

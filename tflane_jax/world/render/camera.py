@@ -113,8 +113,8 @@ def draw_camera(rng: np.random.Generator, config: FrontCameraConfig) -> PinholeC
     """Draw a camera; the same stream and config give the same bits."""
     scale = np.array([config.width / REFERENCE_WIDTH, config.height / REFERENCE_HEIGHT])
     focal = rng.uniform(*config.focal) * scale
-    centre = 0.5 * np.array([config.width, config.height]) + rng.uniform(-1, 1, 2) * config.centre * scale
-    intrinsics = np.array([[focal[0], 0.0, centre[0]], [0.0, focal[1], centre[1]], [0.0, 0.0, 1.0]])
+    center = 0.5 * np.array([config.width, config.height]) + rng.uniform(-1, 1, 2) * config.centre * scale
+    intrinsics = np.array([[focal[0], 0.0, center[0]], [0.0, focal[1], center[1]], [0.0, 0.0, 1.0]])
     above = rng.uniform(*config.above_ground)
     pitch = np.deg2rad(rng.uniform(*config.pitch))
     # Triangular: most cameras are mounted nearly straight.

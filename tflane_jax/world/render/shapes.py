@@ -100,12 +100,12 @@ def wheels(solid: Solid, places: tuple[float, ...], half: float, radius: float) 
             solid.add(hub + 0.55 * radius * ring, _HUB)
 
 
-def box(solid: Solid, centre: np.ndarray, heading: float, size: tuple[float, float], z: tuple[float, float], colour):
+def box(solid: Solid, center: np.ndarray, heading: float, size: tuple[float, float], z: tuple[float, float], colour):
     """Add an upright box: length along the heading and width across it."""
     u = np.array([np.cos(heading), np.sin(heading)])
     v = np.array([-u[1], u[0]])
     a, b = 0.5 * size[0] * u, 0.5 * size[1] * v
-    ring = np.array([centre - a - b, centre + a - b, centre + a + b, centre - a + b])
+    ring = np.array([center - a - b, center + a - b, center + a + b, center - a + b])
     low, high = lift(ring, z[0]), lift(ring, z[1])
     for i in range(4):
         j = (i + 1) % 4

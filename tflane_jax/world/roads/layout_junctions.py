@@ -16,7 +16,7 @@ from tflane_jax.world.roads.layouts import (
     ArmPlan,
     StreetStyle,
     along,
-    centred,
+    centered,
     chance,
     draw,
     draw_style,
@@ -284,7 +284,7 @@ def _arm(
     if chance(rng, 0.6):
         bend = np.deg2rad(draw(rng, (-40.0, 40.0)))
     return ArmPlan(
-        origin=centred(center, heading, style),
+        origin=centered(center, heading, style),
         heading=heading,
         style=style,
         crossing=crossing,
@@ -343,7 +343,7 @@ def _spread(arms: list[ArmPlan]) -> tuple[ArmPlan, ...]:
 def seen_from_end(link: ArmPlan, distance: float) -> ArmPlan:
     """Return a link as an arm of the intersection at its far end.
 
-    The axis is the same line: `centred` shifts it to the same place from both ends.
+    The axis is the same line: `centered` shifts it to the same place from both ends.
     """
     origin = along(link.origin, link.heading, distance)
     return replace(link, origin=origin, heading=link.heading + np.pi, style=link.style.reversed())

@@ -8,7 +8,7 @@ import numpy as np
 
 from tflane_jax.world.roads.config import RoadConfig, SceneKind
 from tflane_jax.world.roads.cross_sections import ExtraLane, Place, SidePlan
-from tflane_jax.world.roads.layouts import StreetStyle, centred, chance, draw, draw_style, left_pocket
+from tflane_jax.world.roads.layouts import StreetStyle, centered, chance, draw, draw_style, left_pocket
 from tflane_jax.world.roads.streets import StreetPlan
 
 # Roads extend beyond the map by this much, because bends bring their ends nearer to its center, metres.
@@ -145,7 +145,7 @@ def _through(
 ) -> StreetPlan:
     heading, half = draw(rng, (-np.pi, np.pi)), config.reach + _BEYOND
     return StreetPlan(
-        origin=centred(np.zeros(2), heading, style),
+        origin=centered(np.zeros(2), heading, style),
         heading=heading,
         start=-half,
         stop=half,

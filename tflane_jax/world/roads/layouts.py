@@ -174,7 +174,7 @@ def left_pocket(style: StreetStyle) -> Place:
     return Place.MEDIAN if style.median >= style.forward.lane_width + LEAST_MEDIAN else Place.LEFT
 
 
-def centred(center: Float[np.ndarray, "2"], heading: float, style: StreetStyle) -> Float[np.ndarray, "2"]:
+def centered(center: Float[np.ndarray, "2"], heading: float, style: StreetStyle) -> Float[np.ndarray, "2"]:
     """Return the origin of the axis that puts the middle of the road on `center`."""
     return np.asarray(center) - style.axis_shift * right_of(heading)
 

@@ -61,7 +61,7 @@ class BevFormerConfig:
             without one. "can_bus": heading, acceleration, rates and velocity, as for published weights
             (`VehicleState.can_bus`), and no motion since the previous frame.
         align: how previous features are brought into the present frame, see the module docstring.
-        rotation_center: centre of the rotation as (column, row), in cells from the grid's corner, unless `align` is
+        rotation_center: center of the rotation as (column, row), in cells from the grid's corner, unless `align` is
             "warp"; None: the vehicle. TopoNet's published (50, 100) on 200 x 100 cells is not the vehicle.
         temporal_value: the present frame's value in temporal attention, see the module docstring.
         value_projections: how many times temporal attention projects its value.

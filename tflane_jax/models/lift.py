@@ -231,7 +231,7 @@ def camera_vector(
 ) -> Float[Array, "v 22"]:
     """Return the parameters of each camera that are inputs of the depth network.
 
-    Focal lengths and centre of the native image, the rows of the affine map, and the camera's pose in the ego frame
+    Focal lengths and center of the native image, the rows of the affine map, and the camera's pose in the ego frame
     (3 x 4).
 
     Args:

@@ -274,7 +274,7 @@ def as_fused(lanes: MarkerGuidance, config: MarkerFusionConfig) -> MarkerGuidanc
 def fusion_mask(
     lanes: MarkerGuidance, cells: Float[ArrayLike, "q 2"], config: MarkerFusionConfig
 ) -> Bool[Array, "#q n"]:
-    """Return which BEV cell, centred at (x, y) in metres, may attend to which of the lanes of `as_fused`."""
+    """Return which BEV cell, centered at (x, y) in metres, may attend to which of the lanes of `as_fused`."""
     if config.radius is None:
         return key_mask(lanes.valid)
     return radius_mask(jnp.asarray(cells), lanes.points, lanes.valid, config.radius)

@@ -168,7 +168,7 @@ class SdMapFusion(nn.Module):
 
 
 def sd_map_mask(sd_map: SdMap, cells: Float[ArrayLike, "q 2"], config: SdMapModuleConfig) -> Bool[Array, "q r"] | None:
-    """Return which BEV cell, centred at (x, y) in metres, may attend to which line of the map; None: to all."""
+    """Return which BEV cell, centered at (x, y) in metres, may attend to which line of the map; None: to all."""
     if config.radius is None:
         return None
     return radius_mask(jnp.asarray(cells), jnp.asarray(sd_map.points), jnp.asarray(sd_map.valid), config.radius)

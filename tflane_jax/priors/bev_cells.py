@@ -11,7 +11,7 @@ from tflane_jax.geometry import BevGrid
 def cells_of(
     unit: Float[Array, "*p 2"], present: Bool[Array, "*p"], grid: BevGrid
 ) -> tuple[Int[Array, "*p"], Float[Array, "*p 2"]]:
-    """Return the cell of each point, and its offset (x, y) from the centre of that cell, in cells.
+    """Return the cell of each point, and its offset (x, y) from the center of that cell, in cells.
 
     Absent points, and those outside the grid, get an index beyond the last cell, which a scatter with `mode="drop"`
     leaves out.

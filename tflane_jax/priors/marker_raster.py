@@ -29,7 +29,7 @@ class MarkerRaster:
     Attributes:
         features: (Q, `CHANNELS`), 0 in cells without lanes: log(1 + number of points / (`between` + 1)); the largest
             factor of these points' lanes; means over the points, weighted by the factor, of cos and sin of the
-            direction, offset (x, y) from the cell centre in cells, first point of its lane (0 or 1), last point (0 or
+            direction, offset (x, y) from the cell center in cells, first point of its lane (0 or 1), last point (0 or
             1).
         factor: (Q,) in [0, 1], the largest of the lanes in the cell: c of Eq. (3) times the weight of Eq. (4); 0
             without lanes.

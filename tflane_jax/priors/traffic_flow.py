@@ -58,7 +58,7 @@ class SelectedTracks:
     """reTF_i and its temporal mask: T_max instances of N frames, by descending weight.
 
     Attributes:
-        position: (T, N, 3) box centres, metres, frame of the host; 0 where not valid.
+        position: (T, N, 3) box centers, metres, frame of the host; 0 where not valid.
         heading: (T, N, 2) cos and sin of the yaw in the ego frame; 0 where not valid.
         size: (T, 3) length, width, height, metres; 0 in padding.
         category: (T,) `scene.RoadUser`; 0 in padding.

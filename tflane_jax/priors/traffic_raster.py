@@ -26,7 +26,7 @@ class TrafficRaster:
     Attributes:
         features: (Q, `CHANNELS`), 0 in cells without traffic: log(1 + frames of all road users in the cell), see
             `between`; recency of the latest of them in (0, 1], 1 for the last frame; means over them of cos and sin of
-            the heading, offset (x, y) from the cell centre in cells, moved = min(1, distance from first to last valid
+            the heading, offset (x, y) from the cell center in cells, moved = min(1, distance from first to last valid
             frame / 10 m), one-hot `RoadUser`.
         touched: (Q,) cells with traffic.
     """

@@ -9,7 +9,7 @@ The paper leaves much open; docs/tf_lane.md lists what we chose, and the setting
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Annotated, Literal, NamedTuple
 
@@ -215,7 +215,7 @@ class TemporalEncoder(nn.Module):
         """Return TF_Feat; rows of invalid instances are finite but meaningless."""
         if self.coordinates == "normalised":  # still 0 in frames that are not valid
             unit = jnp.where(tracks.frame_valid[..., None], self.range.normalise(tracks.position), 0.0)
-            tracks = tracks.replace(position=unit)
+            tracks = replace(tracks, position=unit)
         x = self._embed(tracks)
         for i in range(self.config.depth):
             mask = temporal_mask(self.config.masking, tracks.frame_valid)

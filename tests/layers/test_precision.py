@@ -138,15 +138,17 @@ def test_losses_in_half_precision_are_close_and_recomputing_changes_nothing():
 class Biased(nn.Module):
     @nn.compact
     def __call__(self, x):
+        dense = nn.Dense(2, name="dense")
         with computing("bfloat16"):
-            return nn.Conv(4, (1,), name="convolution")(nn.Dense(3, name="dense")(x))
+            return nn.Conv(4, (1,), name="convolution")(dense(dense(x)))
 
 
 def test_gradients_of_biases_are_summed_in_float32():
     """Regression: sums of bfloat16 over many cells stop growing at some hundred terms of equal size."""
     x = jnp.ones((20_000, 2), jnp.float32)
     params = Biased().init(jax.random.key(0), x)
-    assert Biased().apply(params, x).dtype == jnp.bfloat16
+    _, passed = Biased().apply(params, x, capture_intermediates=True)
+    assert {leaf.dtype for leaf in jax.tree.leaves(passed)} == {jnp.dtype(jnp.bfloat16)}
     gradient = jax.jit(jax.grad(lambda params: Biased().apply(params, x).astype(jnp.float32).sum()))
     np.testing.assert_array_equal(gradient(params)["params"]["convolution"]["bias"], 20_000)
     for step in steps(jax.make_jaxpr(gradient)(params).jaxpr):

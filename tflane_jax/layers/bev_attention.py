@@ -6,7 +6,6 @@ Reference: Li et al. 2022, sections 3.3 and 3.4.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import flax.linen as nn
 import jax
@@ -27,14 +26,12 @@ class TemporalSelfAttention(nn.Module):
         dim: channels in and out.
         heads, points: sampling points per head and frame.
         value_projections: how often the value is projected; twice in OpenLane-V2's baseline and SMERF.
-        dtype: of the projections.
     """
 
     dim: int
     heads: int = 8
     points: int = 4
     value_projections: int = 1
-    dtype: Any = None
 
     @nn.compact
     def __call__(
@@ -56,18 +53,18 @@ class TemporalSelfAttention(nn.Module):
         """
         heads, points = self.heads, self.points
         frames = jnp.stack([history, current])
-        project = nn.Dense(self.dim, kernel_init=_INIT, dtype=self.dtype, name="value_proj")
+        project = nn.Dense(self.dim, kernel_init=_INIT, name="value_proj")
         value = frames
         for _ in range(self.value_projections):
             value = project(value)
         # The two frames are two levels of one value, each with its own softmax; the result is their mean.
-        offsets, logits = offsets_and_logits(jnp.concatenate([history, query], -1), heads, 2, points, self.dtype)
+        offsets, logits = offsets_and_logits(jnp.concatenate([history, query], -1), heads, 2, points)
         weights = 0.5 * jax.nn.softmax(logits, -1)
         shapes = (shape, shape)
         locations = reference[:, None, :, None] + offsets * cell_units(shapes)[None, None, :, None]
         value = value.reshape(-1, heads, self.dim // heads).astype(jnp.float32)
         attended = deformable_attention(value, shapes, locations, weights)
-        return nn.Dense(self.dim, kernel_init=_INIT, dtype=self.dtype, name="output_proj")(attended)
+        return nn.Dense(self.dim, kernel_init=_INIT, name="output_proj")(attended)
 
 
 class SpatialCrossAttention(nn.Module):
@@ -79,14 +76,12 @@ class SpatialCrossAttention(nn.Module):
         capacity: most queries per camera, to skip those that a camera does not see; None evaluates all queries in all
             cameras, with the same result if the capacity suffices. Beyond it, the last queries of the grid do without
             that camera; their number is sown (`CameraQueries.sow_lost`).
-        dtype: of the projections.
     """
 
     dim: int
     heads: int = 8
     points: int = 8
     capacity: int | None = None
-    dtype: Any = None
 
     @nn.compact
     def __call__(
@@ -107,9 +102,9 @@ class SpatialCrossAttention(nn.Module):
             visible: anchors inside the image.
         """
         cameras, heads = len(features), self.heads
-        value = nn.Dense(self.dim, kernel_init=_INIT, dtype=self.dtype, name="value_proj")(features)
+        value = nn.Dense(self.dim, kernel_init=_INIT, name="value_proj")(features)
         value = value.reshape(cameras, -1, heads, self.dim // heads).astype(jnp.float32)
-        offsets, logits = offsets_and_logits(query, heads, len(shapes), self.points, self.dtype)
+        offsets, logits = offsets_and_logits(query, heads, len(shapes), self.points)
         weights = jax.nn.softmax(logits, (-2, -1))
         offsets = offsets * cell_units(shapes)[None, None, :, None]
         by_camera = CameraQueries.of(visible.any(-1), self.capacity)
@@ -117,7 +112,7 @@ class SpatialCrossAttention(nn.Module):
         around = jax.vmap(_around_anchors)(by_camera.take_own(reference), by_camera.take(offsets))
         # Unseen queries have weight 0, so that their gradients are zero.
         found = deformable_attention(value, shapes, around, by_camera.masked(by_camera.take(weights)))
-        return nn.Dense(self.dim, kernel_init=_INIT, dtype=self.dtype, name="output_proj")(by_camera.mean(found))
+        return nn.Dense(self.dim, kernel_init=_INIT, name="output_proj")(by_camera.mean(found))
 
 
 def _around_anchors(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Literal
 
 import flax.linen as nn
 import jax
@@ -82,7 +82,7 @@ class DeformableAttention(nn.Module):
         Raises:
             ValueError: a reference of another shape.
         """
-        offsets, logits = offsets_and_logits(query, self.heads, self.levels, self.points, initial=self.initial)
+        offsets, logits = offsets_and_logits(query, self.heads, self.levels, self.points, self.initial)
         weights = jax.nn.softmax(logits, (-2, -1))
         # Before the projection too: padding must not reach the projection's gradient.
         value = nn.Dense(self.dim, name="value_proj")(_masked(value, valid))
@@ -97,7 +97,6 @@ def offsets_and_logits(
     heads: int,
     levels: int,
     points: int,
-    dtype: Any = None,
     initial: Literal["compass", "star"] = "compass",
 ) -> tuple[Float[Array, "q heads levels p 2"], Float[Array, "q heads levels p"]]:
     """Return sampling offsets and logits in float32, with layers that belong to the calling module."""
@@ -106,12 +105,9 @@ def offsets_and_logits(
         heads * levels * points * 2,
         kernel_init=nn.initializers.zeros,
         bias_init=lambda *_: jnp.asarray(bias, jnp.float32),
-        dtype=dtype,
         name="sampling_offsets",
     )(query)
-    logits = nn.Dense(
-        heads * levels * points, kernel_init=nn.initializers.zeros, dtype=dtype, name="attention_weights"
-    )(query)
+    logits = nn.Dense(heads * levels * points, kernel_init=nn.initializers.zeros, name="attention_weights")(query)
     shape = (query.shape[0], heads, levels, points)
     return offsets.reshape(*shape, 2).astype(jnp.float32), logits.reshape(shape).astype(jnp.float32)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import flax.linen as nn
 import jax.numpy as jnp
@@ -35,11 +34,9 @@ class FeaturePyramid(nn.Module):
 
     Attributes:
         config: sizes.
-        dtype: of the computation; parameters are float32.
     """
 
     config: FeaturePyramidConfig
-    dtype: Any = None
 
     @nn.compact
     def __call__(self, features: Sequence[Float[Array, "v _h _w _c"]]) -> list[Float[Array, "v _h _w d"]]:
@@ -65,7 +62,6 @@ class FeaturePyramid(nn.Module):
             (stride, stride),
             padding,
             kernel_init=_INIT,
-            dtype=self.dtype,
             conv_general_dilated=convolve,
             name=name,
         )

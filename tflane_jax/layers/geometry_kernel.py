@@ -7,7 +7,6 @@ kernel of feature cells; only its weights are learned.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import flax.linen as nn
 import jax
@@ -29,14 +28,12 @@ class GeometryKernelAttention(nn.Module):
         heads: as many as a pillar has anchors; head z reads around anchor z.
         kernel: (rows, columns) of the kernel, odd.
         capacity: most queries per camera, see `SpatialCrossAttention`.
-        dtype: of the projections.
     """
 
     dim: int
     heads: int = 4
     kernel: tuple[int, int] = (3, 5)
     capacity: int | None = None
-    dtype: Any = None
 
     @nn.compact
     def __call__(
@@ -62,19 +59,19 @@ class GeometryKernelAttention(nn.Module):
         (cameras, queries, anchors), heads = visible.shape, self.heads
         if len(shapes) != 1 or anchors != heads:
             raise ValueError(f"one level and {heads} anchors are needed, not {len(shapes)} and {anchors}")
-        value = nn.Dense(self.dim, kernel_init=_INIT, dtype=self.dtype, name="value_proj")(features)
+        value = nn.Dense(self.dim, kernel_init=_INIT, name="value_proj")(features)
         value = value.reshape(cameras, -1, heads, self.dim // heads).astype(jnp.float32)
         rows, columns = self.kernel
         # The module's own zeros do not last: MapTR's transformer initialises all matrices but those of three deformable
         # attentions.
-        logits = nn.Dense(heads * rows * columns, kernel_init=_INIT, dtype=self.dtype, name="attention_weights")(query)
+        logits = nn.Dense(heads * rows * columns, kernel_init=_INIT, name="attention_weights")(query)
         weights = jax.nn.softmax(logits.reshape(queries, heads, rows * columns).astype(jnp.float32), -1)
         by_camera = CameraQueries.of(visible.any(-1), self.capacity)
         by_camera.sow_lost(self)
         # Unseen queries have weight 0, so that their gradients are zero; their reference may be anything.
         around, taken = by_camera.masked(by_camera.take_own(reference)), by_camera.masked(by_camera.take(weights))
         found = kernel_sum(value, shapes[0], around, taken, self.kernel)
-        return nn.Dense(self.dim, kernel_init=_INIT, dtype=self.dtype, name="output_proj")(by_camera.mean(found))
+        return nn.Dense(self.dim, kernel_init=_INIT, name="output_proj")(by_camera.mean(found))
 
 
 def kernel_sum(

@@ -76,11 +76,14 @@ def full(tree: T) -> T:
 
 def _in_half(call: Any, arguments: Any, settings: Any, context: Any) -> Any:
     module = context.module
-    if context.method_name != "__call__" or not isinstance(module, nn.Dense | nn.Conv) or module.dtype is not None:
+    if context.method_name != "__call__" or not isinstance(module, nn.Dense | nn.Conv):
         return call(*arguments, **settings)
-    # A module is frozen, but lives for one trace only.
-    object.__setattr__(module, "dtype", jnp.bfloat16)
-    object.__setattr__(module, "promote_dtype", _all_but_bias)
+    if module.dtype is None:
+        # A module is frozen, but lives for one trace only.
+        object.__setattr__(module, "dtype", jnp.bfloat16)
+        object.__setattr__(module, "promote_dtype", _all_but_bias)
+    elif module.promote_dtype is not _all_but_bias:  # it is, when a module is called once more
+        return call(*arguments, **settings)
     return call(*arguments, **settings).astype(jnp.bfloat16)
 
 

@@ -18,7 +18,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Literal
+from typing import Literal
 
 import flax.linen as nn
 import jax.numpy as jnp
@@ -29,6 +29,7 @@ from tflane_jax.geometry import BevGrid
 from tflane_jax.geometry.pillars import cell_points
 from tflane_jax.layers.bev_attention import SpatialCrossAttention, TemporalSelfAttention
 from tflane_jax.layers.geometry_kernel import GeometryKernelAttention
+from tflane_jax.layers.precision import computing
 from tflane_jax.layers.transformer import add_and_norm
 from tflane_jax.limits import Count, FractionBelowOne, Rules, splits
 from tflane_jax.models.prior import BevHook, fuse_priors
@@ -110,11 +111,6 @@ class BevFormerConfig:
         else:
             multiple = self.spatial_points % self.anchors == 0
             yield "spatial_points", multiple, f"a multiple of anchors ({self.anchors})"
-
-    @property
-    def dtype(self) -> Any:
-        """Dtype of the projections; None: that of the parameters."""
-        return jnp.bfloat16 if self.precision == "bfloat16" else None
 
 
 SMALL_BEVFORMER = BevFormerConfig(
@@ -235,21 +231,25 @@ class BevEncoderLayer(nn.Module):
             config.heads,
             config.temporal_points,
             config.value_projections,
-            config.dtype,
             name="temporal_attention",
         )
-        queries = add("temporal", queries, temporal(queries + position, *frames, (grid.rows, grid.columns), cells))
+        with computing(config.precision):
+            attended = temporal(queries + position, *frames, (grid.rows, grid.columns), cells)
+        queries = add("temporal", queries, attended)
         if config.attention == "kernel":
             spatial = GeometryKernelAttention(
-                config.dim, config.anchors, config.kernel, config.capacity, config.dtype, name="spatial_attention"
+                config.dim, config.anchors, config.kernel, config.capacity, name="spatial_attention"
             )
         else:
             spatial = SpatialCrossAttention(
-                config.dim, config.heads, config.spatial_points, config.capacity, config.dtype, name="spatial_attention"
+                config.dim, config.heads, config.spatial_points, config.capacity, name="spatial_attention"
             )
-        queries = add("spatial", queries, spatial(queries, tokens, shapes, reference, visible))
+        with computing(config.precision):
+            attended = spatial(queries, tokens, shapes, reference, visible)
+        queries = add("spatial", queries, attended)
         queries = fuse(queries.reshape(grid.rows, grid.columns, -1), lambda: position).reshape(queries.shape)
-        x = nn.relu(nn.Dense(config.hidden, kernel_init=init, dtype=config.dtype, name="expand")(queries))
-        x = nn.Dropout(config.dropout, name="hidden_dropout")(x, deterministic=deterministic)
-        x = nn.Dense(config.dim, kernel_init=init, dtype=config.dtype, name="contract")(x)
+        with computing(config.precision):
+            x = nn.relu(nn.Dense(config.hidden, kernel_init=init, name="expand")(queries))
+            x = nn.Dropout(config.dropout, name="hidden_dropout")(x, deterministic=deterministic)
+            x = nn.Dense(config.dim, kernel_init=init, name="contract")(x)
         return add("feed_forward", queries, x)

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, UInt8
 
 from tflane_jax.layers.fpn import FeaturePyramid, FeaturePyramidConfig
+from tflane_jax.layers.precision import computing, full
 from tflane_jax.layers.resnet import RESNET_50, ResNet, ResNetConfig
 from tflane_jax.limits import INCREASING, NOT_EMPTY, CountOrZero, Rules
 from tflane_jax.scene import CameraViews
@@ -72,8 +73,9 @@ class ImageEncoder(nn.Module):
         images = normalise(cameras.image, shown).astype(dtype or jnp.float32)
         backbone = ResNet(config.backbone, config.frozen_stages, config.remat, dtype, name="backbone")
         features = backbone(images, train=train, valid=cameras.valid)
-        pyramid = FeaturePyramid(config.pyramid, dtype, name="pyramid")
-        return [level.astype(jnp.float32) for level in pyramid([features[i] for i in config.stages])]
+        with computing(config.precision):
+            levels = FeaturePyramid(config.pyramid, name="pyramid")([features[i] for i in config.stages])
+        return full(levels)
 
 
 def image_valid(cameras: CameraViews) -> Bool[Array, "v h w"]:

@@ -7,7 +7,8 @@ host: one call per step for every layer and example, because the callback receiv
 loops over them. A program with a host callback can be neither exported nor kept, so do not use it in prediction.
 
 Where a batch is divided among devices, each device (or its host) solves the problems of its own examples. "scipy" is
-refused where these devices are parts of one CPU: its callbacks wait for arrays that the threads they occupy would copy.
+refused where these devices are parts of one CPU: its callbacks occupy the threads that copy their arguments, and can
+hang.
 """
 
 from __future__ import annotations
@@ -73,7 +74,7 @@ def _by_device(solve: Callable[[Any, Any], Any], cost: Float[Array, "*b q n"], v
     """
     devices = jax.sharding.get_abstract_mesh().shape.get(DATA_AXIS, 1)
     if devices > 1 and solve is _on_host and jax.default_backend() == "cpu":
-        raise UserError("matcher 'scipy' may never return on several devices of one CPU: choose 'jax', or one device")
+        raise UserError("matcher 'scipy' can hang on several devices of one CPU: choose 'jax', or one device")
     if devices == 1 or cost.ndim == 2 or cost.shape[0] % devices:
         return solve(cost, valid)
     examples = jax.sharding.PartitionSpec(DATA_AXIS)

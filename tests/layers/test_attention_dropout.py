@@ -98,7 +98,7 @@ def test_a_module_draws_other_weights_with_every_key():
     np.testing.assert_array_equal(run(1, deterministic=False), run(1, deterministic=False))
     assert np.abs(run(1, deterministic=False) - run(2, deterministic=False)).max() > 1e-3
     np.testing.assert_array_equal(run(1), module.apply(params, x, x, x))
-    many = np.mean([run(seed, deterministic=False) for seed in range(400)], 0)
+    many = jax.jit(jax.vmap(lambda seed: run(seed, deterministic=False)))(jnp.arange(400)).mean(0)
     np.testing.assert_allclose(many, run(1), atol=0.1)
 
 

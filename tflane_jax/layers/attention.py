@@ -70,7 +70,7 @@ def masked_attention(
 
 
 class WeightDropout(nn.Dropout):
-    """Dropout of attention weights that blocks of queries can draw one after the other, once more for the gradient."""
+    """Dropout of attention weights; each block of queries draws its own, and draws them again for the gradient."""
 
     def stream(self) -> Array:
         """Return the key of all random numbers of a call."""

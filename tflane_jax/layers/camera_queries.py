@@ -31,13 +31,13 @@ class CameraQueries:
         return cls(seen, first_seen(seen, capacity))
 
     def take(self, of_query: Shaped[Array, "q ..."]) -> Shaped[Array, "v k ..."]:
-        """Return a quantity of the queries, for those of each camera; anything where there is none."""
+        """Return a quantity of the queries for those of each camera; rows beyond them may hold anything."""
         if self.index is None:
             return jnp.broadcast_to(of_query[None], (len(self.seen), *of_query.shape))
         return of_query[self._pick(self.index)]
 
     def take_own(self, of_camera: Shaped[Array, "v q ..."]) -> Shaped[Array, "v k ..."]:
-        """Return a quantity that differs by camera, for the queries of each; anything where there is none."""
+        """Return a quantity of queries and cameras for the queries of each; rows beyond them may hold anything."""
         if self.index is None:
             return of_camera
         pick = self._pick(self.index)

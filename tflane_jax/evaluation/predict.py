@@ -104,7 +104,10 @@ def predicted_batches(
     mesh = None if task.streams else prediction_mesh(batch_size)
     params, part = replicated(params, mesh), share(mesh)
     memory = task.start() if task.streams else None
+    running = None
+    # While the device predicts a batch, the caller reads the one before, and the next one is loaded.
     for indices, batch in ordered_batches(arrays, batch_size, part):
+        predicted = None if running is None else _fetched(*running)
         if task.streams:
             memory, answers = _run_compiled(predict_stream, what, task, params, memory, batch)
         else:
@@ -112,8 +115,16 @@ def predicted_batches(
             answers = _run_compiled(predict_batch, what, task, params, rows, mesh)
             if part[1] > 1:
                 batch = all_rows(batch if needed is None else needed(batch))
-        answers, kept = jax.device_get(answers), slice(len(indices))
-        yield indices, batch, jax.tree.map(lambda leaf, kept=kept: leaf[kept], answers)
+        running = indices, batch, answers
+        if predicted is not None:
+            yield predicted
+    if running is not None:
+        yield _fetched(*running)
+
+
+def _fetched(indices: range, batch: Any, answers: Prediction) -> tuple[range, Any, Prediction]:
+    answers = jax.device_get(answers)
+    return indices, batch, jax.tree.map(lambda leaf: leaf[: len(indices)], answers)
 
 
 def _run_compiled(program: Any, what: str, task: Predictor, *arguments: Any) -> Any:

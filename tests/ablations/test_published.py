@@ -81,6 +81,20 @@ def test_a_remark_on_several_tables_stands_on_the_page_once(tmp_path):
     assert remarks[:4] == [["Of one"], ["on x1 holds here"], ["Of two"], []]
 
 
+def test_the_page_names_tables_whose_claims_were_declared_late(tmp_path):
+    summary = dict.fromkeys(("title", "protocol"), "x") | {"seeds": [0], "steps": [1], "rows": []}
+    summary |= {"cores of a run": [1], "commits": [], "devices": [], "core minutes of a run": {"a": 1.0}}
+    found = "**shown**: a is better than *b* in all/DET_l, +1.00 points (p 0.0100, better in 3 of 3 seeds)"
+    summary |= {"findings": [found], "quoted": {"rows": []}}
+    when = {"x1": "before any run", "x2": "when 1 run had begun already", "x3": "when 12 runs had begun already"}
+    for name, words in when.items():
+        (tmp_path / f"{name}.json").write_text(json.dumps(summary | {"table": name, "declared": f"Declared {words}."}))
+    assert "when some of their runs had begun (how many): x2 (1), x3 (12);" in page(tmp_path).replace("\n", " ")
+    for name in ("x2", "x3"):
+        (tmp_path / f"{name}.json").unlink()
+    assert "had begun" not in page(tmp_path)
+
+
 def test_the_page_tells_which_rows_made_how_many_updates(tmp_path):
     """Regression: "2000, 4000 updates a run"."""
     summary = dict.fromkeys(("table", "title", "protocol", "declared"), "x") | {"seeds": [0], "rows": []}

@@ -51,6 +51,15 @@ def test_ranked_scores_are_compared_in_the_samples_that_all_runs_share():
     assert "seeds alone" not in sentence([effect])
 
 
+def test_the_correction_for_bias_is_about_the_score_of_all_scenes():
+    gain = np.random.default_rng(0).normal(0.05, 0.01, 400)
+    found = of_pairs(*((ranked(0 * gain), ranked(gain + 1e-4 * seed)) for seed in range(4)))
+    for seed, scores in found.rows("", "last")["+TFM"].items():
+        scores["all/mAP"] = 0.04 + 1e-4 * seed  # samples are 0.01 too high on average
+    (effect,) = effects(found, Declaration("all/mAP", (Claim("+TFM"),)), "", "last")
+    assert effect.unbiased == (pytest.approx(effect.low - 0.02, abs=3e-3), pytest.approx(effect.high - 0.02, abs=3e-3))
+
+
 def test_an_effect_that_some_samples_lack_is_not_shown():
     gain = np.linspace(-0.01, 0.05, 400)
     found = of_pairs(*((ranked(0.3 + 0 * gain), ranked(0.3 + gain + 1e-4 * seed)) for seed in range(4)))

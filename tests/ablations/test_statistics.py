@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from tflane_jax.ablations.statistics import holm, interval, nothing_drawn, paired_difference, resampled_ratio
+from tflane_jax.ablations.statistics import (
+    bias_corrected,
+    holm,
+    interval,
+    nothing_drawn,
+    paired_difference,
+    resampled_ratio,
+)
 from tflane_jax.evaluation.by_scene import scene_weights
 
 
@@ -122,6 +129,25 @@ def test_the_interval_of_a_mean_has_the_width_that_theory_gives():
     assert high - low == pytest.approx(2 * 1.96 * values.std() / 20, rel=0.05)
     assert low < values.mean() < high
     np.testing.assert_array_equal(scene_weights(5, 3), scene_weights(5, 3))
+
+
+@pytest.mark.parametrize("shift", [0.0, 0.1, -0.15])
+def test_the_corrected_interval_moves_by_twice_the_bias(shift):
+    """Of normal samples with mean m and standard deviation s, z_0 = (value - m) / s: it is 2 value - m -+ 1.96 s."""
+    samples = 0.2 * stats.norm.ppf((np.arange(100_000) + 0.5) / 100_000) + shift
+    expected = -shift + np.array([-1.0, 1.0]) * 1.96 * 0.2
+    np.testing.assert_allclose(bias_corrected(np.append(samples, np.nan), 0.0), expected, atol=2e-3)
+    if shift == 0.0:
+        np.testing.assert_allclose(bias_corrected(samples, 0.0), interval(samples), atol=1e-4)
+
+
+@pytest.mark.parametrize("samples", [[], [math.nan], [1.0, 2.0], [-1.0]])
+def test_samples_on_one_side_of_the_value_have_no_corrected_interval(samples):
+    assert all(map(math.isnan, bias_corrected(np.array(samples), 0.0)))
+
+
+def test_samples_that_equal_the_value_count_half():
+    assert bias_corrected(np.zeros(5), 0.0) == (0.0, 0.0)
 
 
 def test_samples_without_anything_to_count_give_zero():

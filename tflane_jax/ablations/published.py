@@ -25,8 +25,9 @@ from tflane_jax.plots.tables import format_table
 _WIDTH = 120
 _CLAIMS = (
     "The difference is treatment minus control in the table's primary measure; p is corrected for the claims of the "
-    "table. Negative controls and secondary measures stand with the tables below. Of an interim table, more seeds may "
-    "change a verdict. The paper's difference is that of its own data, in the measure that stands beside it."
+    "table, not for the number of tables. Negative controls and secondary measures stand with the tables below. Of an "
+    "interim table, more seeds may change a verdict. The paper's difference is that of its own data, in the measure "
+    "that stands beside it."
 )
 
 
@@ -114,7 +115,7 @@ def page(folder: Path) -> str:
     ]
     linked = {f"[{name}](#{_anchor(each)}){_if_interim(each)}": each for name, each in found.items()}
     if claims := verdicts(linked):
-        lines += ["", "## All claims", "", *_wrapped(_CLAIMS), "", format_table(claims)]
+        lines += ["", "## All claims", "", *_wrapped(_CLAIMS + _declared_late(found)), "", format_table(claims)]
         for group in _drawn(found):
             lines += ["", f"![Claims of {group}]({folder.name}/{group}.png)"]
     remarked: dict[str, str] = {}  # the table that says it first, by remark
@@ -130,6 +131,18 @@ def page(folder: Path) -> str:
             *_wrapped(", ".join(f"`{name}` ({TABLES[name].title})" for name in missing)),
         ]
     return "\n".join(lines) + "\n"
+
+
+def _declared_late(found: Mapping[str, Mapping[str, Any]]) -> str:
+    """Return a sentence that names the tables whose claims were declared when runs of theirs had begun; "" for none."""
+    counts = {name: re.match(r"Declared when (\d+) runs? had begun", each["declared"]) for name, each in found.items()}
+    late = [f"{name} ({count[1]})" for name, count in counts.items() if count]
+    if not late:
+        return ""
+    return (
+        f" Claims of these tables were declared when some of their runs had begun (how many): {', '.join(late)}; what "
+        "was known of them by then stands with their discussion."
+    )
 
 
 def summaries(folder: Path) -> dict[str, Mapping[str, Any]]:

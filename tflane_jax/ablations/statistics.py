@@ -125,3 +125,25 @@ def interval(samples: Float[np.ndarray, " b"], level: float = 0.95) -> tuple[flo
         return math.nan, math.nan
     low, high = np.quantile(samples, [(1 - level) / 2, (1 + level) / 2])
     return float(low), float(high)
+
+
+def bias_corrected(samples: Float[np.ndarray, " b"], value: float, level: float = 0.95) -> tuple[float, float]:
+    """Return the bias-corrected percentile interval of bootstrap samples (Efron 1981).
+
+    Its ends are the quantiles at Phi(2 z_0 + z) with z = -+Phi^-1((1 + level) / 2), where Phi(z_0) is the fraction of
+    samples below the value: one half without bias, which gives the percentile interval. NaN where all samples lie on
+    one side of the value; samples that are NaN do not count.
+
+    Args:
+        samples: of a statistic.
+        value: the statistic itself.
+    """
+    from scipy.stats import norm
+
+    samples = samples[~np.isnan(samples)]
+    below = (np.mean(samples < value) + np.mean(samples <= value)) / 2 if len(samples) else 0.0
+    if not 0 < below < 1:
+        return math.nan, math.nan
+    ends = norm.cdf(2 * norm.ppf(below) + norm.ppf([(1 - level) / 2, (1 + level) / 2]))
+    low, high = np.quantile(samples, ends)
+    return float(low), float(high)

@@ -29,7 +29,6 @@ def count(tree):
     return sum(leaf.size for leaf in jax.tree.leaves(tree))
 
 
-@pytest.mark.slow
 def test_toponet_is_as_large_as_the_reference():
     config = toponet.paper_config()
     module, example = config.build(), camera_shapes(config.encoder)
@@ -52,7 +51,6 @@ def test_toponet_is_as_large_as_the_reference():
     assert answer.elements.lane_logits.shape == (6, 200, 100)
 
 
-@pytest.mark.slow
 def test_lanesegnet_is_as_large_as_the_reference():
     config = lanesegnet.paper_config()
     module, example = config.build(), camera_shapes(config.encoder)

@@ -289,10 +289,12 @@ def test_tusimples_folder_is_checked(tmp_path, capsys):
     (tmp_path / "clips" / "a.jpg").touch()
     for name in ("label_data_0313.json", "label_data_0531.json"):
         (tmp_path / name).write_text(json.dumps(record) + "\n")
-    assert main(["data", "check", "--format", "tusimple", str(tmp_path)]) == 2
+    assert main(["data", "check", "--format", "tusimple", str(tmp_path)]) == 0
     text = capsys.readouterr().out
-    assert "lacks label_data_0601.json of split train" in text
-    assert "lacks the label file test_label.json of split test" in text
+    assert "split train: there is no label_data_0601.json" in text
+    assert "split test: there is no test_label.json" in text
+    assert main(["data", "check", "--format", "tusimple", str(tmp_path / "clips")]) == 2
+    assert f"{tmp_path} does, name that folder" in capsys.readouterr().err
     shutil.copy(tmp_path / "label_data_0313.json", tmp_path / "label_data_0601.json")
     (tmp_path / "label_data_0601.json").write_text(json.dumps(record | {"raw_file": "clips/b.jpg"}) + "\n")
     shutil.copy(tmp_path / "clips" / "a.jpg", tmp_path / "clips" / "b.jpg")

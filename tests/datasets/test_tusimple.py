@@ -1,7 +1,6 @@
 """TuSimple's label files and images as a dataset."""
 
 import json
-import shutil
 from dataclasses import replace
 
 import cv2
@@ -10,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from tests.datasets.small_tusimple import ROWS_48, dataset_of, write_tusimple
 from tests.shared import shared_path
 from tflane_jax.datasets import sources
 from tflane_jax.datasets.augmentation import AugmentationConfig
@@ -17,7 +17,7 @@ from tflane_jax.datasets.base import TruncationWarning
 from tflane_jax.datasets.batches import batches
 from tflane_jax.datasets.lane_rows import lane_lines, row_lanes
 from tflane_jax.datasets.streaming import Streamed, StreamingConfig
-from tflane_jax.datasets.tusimple import TuSimpleConfig, TuSimpleData, TuSimpleDataset, load_road_images
+from tflane_jax.datasets.tusimple import TuSimpleConfig, TuSimpleData, load_road_images
 from tflane_jax.errors import UserError
 from tflane_jax.evaluation.results import EvaluationConfig
 from tflane_jax.files.tusimple import ROWS, RowLanes
@@ -25,29 +25,10 @@ from tflane_jax.metrics.tusimple import TuSimpleMetrics, score_image
 from tflane_jax.scene import CurvePrediction, Prediction
 from tflane_jax.tasks.lane_shape import LaneShapeTask, found_lanes
 
-ROWS_48 = ROWS[8:]
-
 
 @pytest.fixture
 def root(tmp_path):
-    """Two label files of two frames each, 48 and 56 heights, and their images."""
-    files = {"label_data_0313.json": ROWS_48, "label_data_0531.json": ROWS}
-    for f, (name, rows) in enumerate(files.items()):
-        records = []
-        for i in range(2):
-            raw = f"clips/{f}/{i}/20.jpg"
-            (tmp_path / raw).parent.mkdir(parents=True)
-            image = np.full((720, 1280, 3), 40 * (2 * f + i), np.uint8)
-            assert cv2.imwrite(str(tmp_path / raw), image)
-            present = [-2] * 5 + list(range(100, 100 + len(rows) - 5))
-            lanes = [[x + 500 if x > 0 else x for x in present], present, [-2] * len(rows)]
-            records.append({"raw_file": raw, "lanes": lanes, "h_samples": rows.tolist()})
-        (tmp_path / name).write_text("".join(json.dumps(record) + "\n" for record in records))
-    return tmp_path
-
-
-def dataset_of(root, **changes):
-    return TuSimpleDataset(TuSimpleConfig(str(root), **changes))
+    return write_tusimple(tmp_path)
 
 
 def test_labels_of_48_heights_stand_in_the_56_rows(root):
@@ -178,76 +159,6 @@ def test_images_of_another_size_are_measured_in_their_own_pixels(tmp_path, read_
         assert score_image(found, truth) == (1.0, 0.0, 0.0)
     labels = loaded(tmp_path, "disk").truth
     assert [truth.size for truth in labels] == list(sizes.values())
-
-
-def test_splits_name_their_files(root):
-    assert [len(dataset_of(root, split=split)) for split in ("train", "val", "all")] == [2, 2, 4]
-    train = dataset_of(root, split="train")
-    assert train.name == "tusimple-train"
-    assert train.summary() == "tusimple-train: 2 frames of label_data_0313.json; not found: label_data_0601.json"
-    assert train.absent_files == ("label_data_0601.json",)
-    with pytest.raises(UserError, match=r"lacks the label file test_label.json of split test \(it has label_data_0313"):
-        dataset_of(root, split="test")
-    shutil.copy(root / "label_data_0531.json", root / "test_label.json")
-    test = dataset_of(root, split="test")
-    assert (len(test), test.summary()) == (2, "tusimple-test: 2 frames of test_label.json")
-    assert len(dataset_of(root, split="all")) == 4  # never the test set
-    own = dataset_of(root, label_files=("label_data_0531.json",))
-    assert (own.name, own.raw_file(0)) == ("tusimple-custom", "clips/1/0/20.jpg")
-    with pytest.raises(UserError, match=r"lacks the label file mine.json of `label_files`"):
-        dataset_of(root, label_files=("label_data_0531.json", "mine.json"))
-
-
-def moved(root, folder, *names):
-    """Move parts of the folder below another one, as an archive is unpacked."""
-    (root / folder).mkdir()
-    for name in names:
-        (root / name).rename(root / folder / name)
-
-
-@pytest.mark.parametrize("below", ["", "LaneDetection/"])
-def test_the_archives_may_have_folders_of_their_own(root, below):
-    shutil.copy(root / "label_data_0531.json", root / "test_label.json")
-    plain = {split: dataset_of(root, split=split).example(0) for split in ("train", "val", "test")}
-    tests = root / below / "test_set"
-    shutil.copytree(root / "clips" / "1", tests / "clips" / "1")
-    (tests / "test_tasks_0627.json").write_text("")
-    moved(root, f"{below}train_set", "clips", "label_data_0313.json", "label_data_0531.json")
-    for at_root in (True, False):  # the test labels are a download of their own
-        if not at_root:
-            (root / "test_label.json").rename(tests / "test_label.json")
-        for split, expected in plain.items():
-            found = dataset_of(root, split=split)
-            jax.tree.map(np.testing.assert_array_equal, found.example(0), expected)
-            assert len(found) == 2
-    assert len(dataset_of(root, split="all")) == 4
-    (tests / "test_label.json").unlink()
-    with pytest.raises(UserError, match=r"test_tasks_0627.json names the test images without their lanes\): download"):
-        dataset_of(root, split="test")
-
-
-def test_lstrs_layout_is_found_from_the_folder_above(root):
-    moved(root, "LaneDetection", "clips", "label_data_0313.json", "label_data_0531.json")
-    assert [len(dataset_of(root, split=split)) for split in ("train", "val", "all")] == [2, 2, 4]
-    assert dataset_of(root).example(3).image.mean() == pytest.approx(120, abs=1)
-
-
-def test_further_label_files_join_the_whole(root):
-    (root / "label_data_0313.json").rename(root / "label_data_mine.json")
-    found = dataset_of(root)
-    assert [file.name for file in found.label_files] == ["label_data_0531.json", "label_data_mine.json"]
-    assert len(found) == 4
-
-
-def test_mistakes_in_the_folder_are_named(root):
-    with pytest.raises(UserError, match=r"no folder .*nowhere"):
-        dataset_of(root / "nowhere")
-    shutil.copy(root / "label_data_0531.json", root / "label_data_copy.json")
-    with pytest.raises(UserError, match=r"label_data_copy.json labels clips/1/0/20.jpg, which an earlier"):
-        dataset_of(root)
-    (root / "label_data_copy.json").write_text("\n")
-    with pytest.raises(UserError, match="no labelled frames"):
-        dataset_of(root, label_files=("label_data_copy.json",))
 
 
 def test_missing_images_are_one_error(root):

@@ -16,7 +16,6 @@ from collections.abc import Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
@@ -28,29 +27,20 @@ from tflane_jax.datasets.lane_rows import LabelledImages, lane_lines
 from tflane_jax.datasets.loading import IN_MEMORY
 from tflane_jax.datasets.photos import HEIGHT, WIDTH
 from tflane_jax.datasets.streaming import Streamed, StreamingConfig
+from tflane_jax.datasets.tusimple_files import (
+    LabelSplit,
+    absent_splits,
+    check_label_files,
+    find_label_files,
+    further_files,
+    image_folder,
+)
 from tflane_jax.errors import UserError
 from tflane_jax.files.fields import file_within
 from tflane_jax.files.images import read_image, resize
 from tflane_jax.files.tusimple import NO_DRIVES, RowLanes, read_truth
 from tflane_jax.progress import progress_bar
 from tflane_jax.scene import LaneLines, RoadImage
-
-LabelSplit = Literal["train", "val", "test", "all"]
-
-_TRAIN, _VAL = ("label_data_0313.json", "label_data_0601.json"), ("label_data_0531.json",)
-_SPLIT_FILES: dict[LabelSplit, tuple[str, ...]] = {
-    "train": _TRAIN,
-    "val": _VAL,
-    "test": ("test_label.json",),
-    "all": tuple(sorted(_TRAIN + _VAL)),
-}
-# Folders below the root in which label files and clips may be.
-_FOLDERS = (
-    *("", "LaneDetection", "train_set", "test_set"),
-    *("LaneDetection/train_set", "LaneDetection/test_set"),
-)
-# Comes with the test images and names them, without lanes.
-_TASKS = "test_tasks_0627.json"
 
 
 @dataclass(frozen=True)
@@ -93,7 +83,7 @@ class TuSimpleDataset:
         root = Path(config.root)
         self.config = config
         self.name = f"tusimple-{'custom' if config.label_files else config.split}"
-        self.label_files, self.absent_files = _label_files(root, config)
+        self.label_files, self.absent_files = find_label_files(root, config.split, config.label_files)
         labels: dict[str, tuple[RowLanes, Path]] = {}
         for file in self.label_files:
             read = read_truth(file)
@@ -102,7 +92,7 @@ class TuSimpleDataset:
                 raise UserError(f"{file} labels {twice}, which an earlier label file labels too: leave one of them out")
             for name in read:
                 file_within(root, name, f"{file}: raw_file")
-            folder = _image_folder(root, file, list(read))
+            folder = image_folder(root, file, list(read))
             labels |= {name: (lanes, folder) for name, lanes in read.items()}
         self._labels = [(name, lanes, folder) for name, (lanes, folder) in labels.items()]
         self._sizes: dict[str, tuple[int, int]] = {}  # of the images read so far
@@ -187,37 +177,6 @@ def load_road_images(dataset: TuSimpleDataset, *, progress: bool = True, workers
     return RoadImage(images, np.broadcast_to(True, images.shape[:3]), stacked)
 
 
-def _label_files(root: Path, config: TuSimpleConfig) -> tuple[tuple[Path, ...], tuple[str, ...]]:
-    """Return the files to read, and the names of those that are not there."""
-    if not root.is_dir():
-        raise UserError(f"there is no folder {root}: set `root` to TuSimple's folder of label files and clips")
-    names = config.label_files or _SPLIT_FILES[config.split]
-    present: dict[str, Path] = {}
-    for folder in reversed(_FOLDERS):  # a file in the root itself comes first
-        present |= {path.name: path for path in sorted((root / folder).glob("*.json"))}
-    if config.split == "all" and not config.label_files:
-        names = tuple(sorted({*names, *(name for name in present if name.startswith("label_data_"))}))
-    # Names in `label_files` may have folders.
-    paths = {name: present.get(name, root / name) for name in names}
-    found = tuple(path for path in paths.values() if path.is_file())
-    absent = tuple(name for name, path in paths.items() if not path.is_file())
-    if not found or (config.label_files and absent):
-        tasks = f"; {_TASKS} names the test images without their lanes" if _TASKS in present else ""
-        raise UserError(
-            f"{root} lacks the label file{'s' * (len(absent) != 1)} {', '.join(absent)} of "
-            f"{'`label_files`' if config.label_files else f'split {config.split}'} (it has "
-            f"{', '.join(sorted(present)) or 'none'}{tasks}): download them, or choose another split or `label_files`"
-        )
-    return found, absent
-
-
-def _image_folder(root: Path, label_file: Path, names: list[str]) -> Path:
-    """Return the folder from which the names of a label file's images start: its own, or another of `_FOLDERS`."""
-    folders = (label_file.parent, *(root / folder for folder in _FOLDERS))
-    some = names[:: max(len(names) // 10, 1)]
-    return max(folders, key=lambda folder: sum((folder / name).is_file() for name in some))
-
-
 @dataclass(frozen=True)
 class TuSimpleData:
     """TuSimple for training, validation and test.
@@ -273,24 +232,34 @@ def _choose(choice: Choice) -> TuSimpleConfig:
 
 def _content(config: TuSimpleConfig) -> str:
     """Return the hash of the label files, of which each has the names of its images and their lanes."""
-    files, _ = _label_files(Path(config.root), config)
+    files, _ = find_label_files(Path(config.root), config.split, config.label_files)
     return hashlib.sha256(b"".join(hashlib.sha256(file.read_bytes()).digest() for file in files)).hexdigest()
 
 
 def check_tusimple(root: Path) -> FolderCheck:
-    """Count the labelled frames of each split; faults are missing label files, images and malformed records."""
-    rows, faults = [], []
+    """Count the labelled frames of each split, and of label files that only "all" reads.
+
+    Faults are missing images and malformed records. Label files that are not there are none: many people have a part.
+
+    Raises UserError where there is no label file at all; it names the folder above or below that has some.
+    """
     if not root.is_dir():
         raise UserError(f"{root} is no folder: name TuSimple's, with its label files and clips")
-    for split in SPLITS:
+    check_label_files(root)
+    rows, faults, absent = [], [], absent_splits(root)
+    skipped = [f"split {split}: there is no {' and no '.join(names)}" for split, names in absent.items()]
+    parts = {split: TuSimpleConfig(str(root), split) for split in SPLITS if split not in absent}
+    if further := further_files(root):
+        parts["all, further files"] = TuSimpleConfig(str(root), label_files=further)
+    for part, config in parts.items():
         try:
-            dataset = TuSimpleDataset(TuSimpleConfig(str(root), split))
+            dataset = TuSimpleDataset(config)
         except UserError as error:
             faults.append(str(error))
             continue
-        faults += [f"{root} lacks {name} of split {split}" for name in dataset.absent_files]
-        rows.append({"split": split, "frames": len(dataset), "label files": len(dataset.label_files)})
-    return FolderCheck("TuSimple", rows, faults)
+        skipped += [f"split {part}: there is no {name}" for name in dataset.absent_files]
+        rows.append({"split": part, "frames": len(dataset), "label files": len(dataset.label_files)})
+    return FolderCheck("TuSimple", rows, faults, skipped)
 
 
 SOURCE = DataSource(

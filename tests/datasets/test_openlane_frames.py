@@ -4,6 +4,7 @@ import json
 
 import pytest
 
+from tflane_jax.datasets.openlane_check import check_openlane_v2
 from tflane_jax.datasets.openlane_frames import frames_content, list_frames
 from tflane_jax.errors import UserError
 
@@ -34,6 +35,24 @@ def test_a_root_with_one_split_names_the_options_that_take_it(tmp_path, data_dic
 def test_a_folder_without_frames_is_none_of_openlane_v2(tmp_path):
     with pytest.raises(UserError, match=r"holds no val/<segment>/info/<timestamp>\.json: is it OpenLane-V2's folder"):
         list_frames(tmp_path, "val", "A")
+
+
+@pytest.mark.parametrize("named", ["above", "root/train", "root/train/1", "root/train/1/info"])
+def test_another_level_of_the_folder_is_told(tmp_path, named):
+    """Regression: one message, "is it OpenLane-V2's folder?", for every level."""
+    root = tmp_path / "above" / "root"
+    listed(root, "train", ("1", "2"), None)
+    folder = root.parent / named if named != "above" else root.parent
+    said = rf"^{folder} holds no \S+/<segment>/info/<timestamp>\.json: OpenLane-V2's folder is {root}, name that$"
+    with pytest.raises(UserError, match=said):
+        list_frames(folder, "train", "A")
+    with pytest.raises(UserError, match=said):
+        check_openlane_v2(folder, progress=False)
+
+
+def test_the_check_of_no_folder_says_so(tmp_path):
+    with pytest.raises(UserError, match=r"there is no folder .*none: name OpenLane-V2's"):
+        check_openlane_v2(tmp_path / "none", progress=False)
 
 
 @pytest.mark.parametrize("name", ["first", "9" * 25])

@@ -26,6 +26,7 @@ from tflane_jax.datasets.openlane_frames import (
     SubsetName,
     has_time,
     info_path,
+    no_frames,
     no_time,
     read_frame,
     source_logs,
@@ -85,10 +86,12 @@ def check_openlane_v2(
     Raises UserError where there is no frame at all, or `tracks` holds no log.
     """
     root, faults, skipped = Path(root), [], []
+    if not root.is_dir():
+        raise UserError(f"there is no folder {root}: name OpenLane-V2's")
     on_disk = frames_on_disk(root, skipped)
     named = named_frames(root, on_disk, faults, skipped)
     if not any(on_disk.values()):
-        raise UserError(f"{root} holds no <split>/<segment>/info/<timestamp>.json: is it OpenLane-V2's folder?")
+        raise no_frames(root, "<split>")
     subsets = subsets_of(root, on_disk)
     present: list[SubsetName] = sorted(set(subsets.values()))
     rows = []

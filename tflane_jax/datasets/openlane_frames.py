@@ -23,6 +23,7 @@ from tflane_jax.datasets.base import SPLITS, Split
 from tflane_jax.datasets.plausible import FARTHEST, MOST_PIXELS
 from tflane_jax.errors import UserError
 from tflane_jax.files.fields import file_within, is_time, load_json, load_members, member, numbers
+from tflane_jax.files.folders import folder_nearby
 from tflane_jax.files.openlane import CENTERLINE, DATA_DICT, SEGMENT, FrameKey, frames_of
 from tflane_jax.files.wording import shown
 from tflane_jax.geometry import pose_matrix
@@ -140,8 +141,7 @@ def list_frames(root: Path, split: str, subset: SubsetName, data_dict: str | Non
         keys = _in_folders(root, split)
         if not keys:
             others = [name for name in SPLITS if _in_folders(root, name)]
-            remedy = _instead(split, others) if others else ": is it OpenLane-V2's folder?"
-            raise UserError(f"{root} holds no {split}/<segment>/info/<timestamp>.json{remedy}")
+            raise no_frames(root, split, _instead(split, others) if others else None)
         keys = _of_subset(root, keys, subset)
     else:
         content = load_json(file)
@@ -153,6 +153,14 @@ def list_frames(root: Path, split: str, subset: SubsetName, data_dict: str | Non
     if wrong := [key for key in sorted(keys) if not has_time(key, subset)]:
         raise UserError(f"{root}: frame {wrong[0]} {no_time(subset)}: leave the file out")
     return sorted(set(keys), key=lambda key: (key.segment, int(key.timestamp)))
+
+
+def no_frames(root: Path, split: str, remedy: str | None = None) -> UserError:
+    """Return the error of a folder without frames; its remedy is by default the folder above or below that has some."""
+    if remedy is None:
+        near = folder_nearby(root, _has_frames)
+        remedy = ": is it OpenLane-V2's folder?" if near is None else f": OpenLane-V2's folder is {near}, name that"
+    return UserError(f"{root} holds no {split}/<segment>/info/<timestamp>.json{remedy}")
 
 
 def frames_content(root: Path, split: str, subset: SubsetName, data_dict: str | None = None) -> str:
@@ -192,6 +200,10 @@ def subset_of_frame(root: Path, key: FrameKey) -> SubsetName | None:
 def _in_folders(root: Path, split: str) -> list[FrameKey]:
     files = (root / split).glob("*/info/*.json")
     return [FrameKey(split, path.parent.parent.name, path.stem.removesuffix("-ls")) for path in files]
+
+
+def _has_frames(root: Path) -> bool:
+    return any(True for split in SPLITS for _ in (root / split).glob("*/info/*.json"))
 
 
 def _instead(split: str, others: Sequence[str]) -> str:

@@ -8,7 +8,7 @@ import pytest
 
 from tests.shared import shared_path
 from tflane_jax.cli import main
-from tflane_jax.datasets.argoverse2_log import load_log
+from tflane_jax.datasets.argoverse2_log import ANNOTATIONS, load_log
 from tflane_jax.datasets.marker_observations import markers_of
 from tflane_jax.geometry import transform_points
 from tflane_jax.markers.store_files import load_store
@@ -57,6 +57,18 @@ def test_errors_name_the_remedy(tmp_path, arguments, message, capsys):
     assert main(["markers", "store", *arguments, "--out", str(out)]) == 2
     assert message in capsys.readouterr().err
     assert not out.exists()
+
+
+@pytest.mark.parametrize("level", ["", "sensor", "sensor/val"])
+def test_a_folder_of_logs_names_one_of_them(tmp_path, level, capsys):
+    """Regression: its annotations.feather was to be downloaded."""
+    for log in ("b", "a"):
+        (tmp_path / "sensor" / "val" / log).mkdir(parents=True)
+        (tmp_path / "sensor" / "val" / log / ANNOTATIONS).touch()
+    assert main(["markers", "store", "--log", str(tmp_path / level), "--out", str(tmp_path / "store.json")]) == 2
+    said = capsys.readouterr().err
+    assert "is a folder of logs, and a store is of one: name it, such as " in said
+    assert str(tmp_path / "sensor" / "val" / "a") in said
 
 
 def test_real_logs_get_virtual_markers(tmp_path):

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from tflane_jax.commands.outputs import check_output
-from tflane_jax.datasets.argoverse2_log import load_log
+from tflane_jax.datasets.argoverse2_log import ANNOTATIONS, load_log, logs_within
 from tflane_jax.datasets.marker_observations import store_of_log
 from tflane_jax.errors import UserError
 from tflane_jax.markers.store_files import load_store, save_store
@@ -68,7 +68,10 @@ def _open_log(name: str) -> Log:
         return simulate(int(name))
     if not Path(name).is_dir():
         raise UserError(f"--log {name} is neither a scene number nor a folder: give an Argoverse 2 log or, say, 17")
-    return load_log(Path(name))
+    folder = Path(name)
+    if not (folder / ANNOTATIONS).is_file() and (logs := logs_within(folder)):
+        raise UserError(f"--log {name} is a folder of logs, and a store is of one: name it, such as {logs[0]}")
+    return load_log(folder)
 
 
 def day_of(text: str | None, option: str) -> datetime.date | None:

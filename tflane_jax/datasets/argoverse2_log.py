@@ -286,6 +286,13 @@ def check_log(folder: Path) -> list[str]:
     return lacking
 
 
+def logs_within(root: Path) -> list[Path]:
+    """Return the log folders where `find_logs` looks for them, sorted by log id; two may have the same id."""
+    patterns = ("", "*", "*/*", "sensor/*/*")
+    paths = [path.parent for p in patterns for path in sorted(root.glob(f"{p}/{ANNOTATIONS}".lstrip("/")))]
+    return sorted({path.resolve(): path for path in reversed(paths)}.values(), key=lambda path: path.name)
+
+
 def find_logs(root: Path) -> list[Path]:
     """Return the log folders, sorted by log id, in a dataset root, a split, a folder of logs, or one log itself.
 
@@ -296,9 +303,7 @@ def find_logs(root: Path) -> list[Path]:
     root = named_folder(root)  # that of one log tells its id
     if not root.exists():
         raise UserError(f"there is no {root}: name a folder of Argoverse 2 logs, or one log")
-    patterns = ("", "*", "*/*", "sensor/*/*")
-    paths = [path.parent for p in patterns for path in sorted(root.glob(f"{p}/{ANNOTATIONS}".lstrip("/")))]
-    found = sorted({path.resolve(): path for path in reversed(paths)}.values(), key=lambda path: path.name)
+    found = logs_within(root)
     if not found:
         raise UserError(
             f"{root} holds no Argoverse 2 log: no {ANNOTATIONS} in it, in */, in */*/ or in sensor/<split>/<log>/"

@@ -10,7 +10,8 @@ from tests.datasets.small_argoverse2 import write_log
 from tflane_jax.commands.sources import chosen_source
 from tflane_jax.config import RunConfig
 from tflane_jax.datasets.argoverse2_log import find_logs, load_log
-from tflane_jax.datasets.nuscenes_tables import find_tables, read_tables
+from tflane_jax.datasets.nuscenes_folder import find_tables
+from tflane_jax.datasets.nuscenes_tables import read_tables
 from tflane_jax.datasets.road_maps import find_maps
 from tflane_jax.files.folders import named_folder
 

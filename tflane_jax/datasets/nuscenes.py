@@ -34,6 +34,7 @@ from tflane_jax.datasets.nuscenes_cameras import (
 from tflane_jax.datasets.nuscenes_can_bus import CAN_BUS_SIZE
 from tflane_jax.datasets.nuscenes_check import check_nuscenes
 from tflane_jax.datasets.nuscenes_depth import with_depth, without_depth
+from tflane_jax.datasets.nuscenes_folder import find_tables
 from tflane_jax.datasets.nuscenes_log import (
     ReferenceFrame,
     SceneFrames,
@@ -45,7 +46,7 @@ from tflane_jax.datasets.nuscenes_log import (
 from tflane_jax.datasets.nuscenes_map import MapExpansion, read_expansion
 from tflane_jax.datasets.nuscenes_scenes import NUSCENES_SIZES
 from tflane_jax.datasets.nuscenes_splits import listed_scenes, split_scenes
-from tflane_jax.datasets.nuscenes_tables import find_tables, shared_tables
+from tflane_jax.datasets.nuscenes_tables import shared_tables
 from tflane_jax.datasets.openlane_example import camera_views, empty_views
 from tflane_jax.datasets.openlane_frames import SUBSETS, FrameCamera
 from tflane_jax.datasets.overlap import frame_drives
@@ -72,7 +73,7 @@ class NuScenesSettings:
 
     Attributes:
         root: folder of the data set.
-        version: folder of the tables, such as "v1.0-mini"; None finds it, see `nuscenes_tables.find_tables`.
+        version: folder of the tables, such as "v1.0-mini"; None finds it, see `nuscenes_folder.find_tables`.
         splits: JSON file {split: [scene names]} in place of the official splits.
         misplaced: whether to use five official scenes that do not fit the map, as MapTR does: "keep" or "drop", see
             `nuscenes_splits.MISPLACED`.

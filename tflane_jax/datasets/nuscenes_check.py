@@ -7,10 +7,11 @@ from pathlib import Path
 
 from tflane_jax.datasets.data_source import FolderCheck
 from tflane_jax.datasets.nuscenes_cameras import camera_fits, missing_images, sample_cameras
+from tflane_jax.datasets.nuscenes_folder import find_tables
 from tflane_jax.datasets.nuscenes_log import SceneFrames, scene_frames, scene_tracks
 from tflane_jax.datasets.nuscenes_map import MapExpansion, read_expansion
 from tflane_jax.datasets.nuscenes_splits import MISPLACED
-from tflane_jax.datasets.nuscenes_tables import Tables, find_tables, read_tables
+from tflane_jax.datasets.nuscenes_tables import Tables, read_tables
 from tflane_jax.datasets.openlane_check_cameras import damage_of, image_size
 from tflane_jax.datasets.plausible import FAR, check_place
 from tflane_jax.datasets.view_images import ImageConfig

@@ -10,7 +10,7 @@ from typing import Any
 from tflane_jax.datasets.log_frames import LogOutline
 from tflane_jax.datasets.nuscenes_log import key_frames, scene_frames, scene_log
 from tflane_jax.datasets.nuscenes_map import MapExpansion, read_expansion
-from tflane_jax.datasets.nuscenes_tables import TABLES, file_state, shared_tables
+from tflane_jax.datasets.nuscenes_tables import TABLES, check_tables, file_state, shared_tables
 from tflane_jax.errors import UserError
 from tflane_jax.files.fields import member
 from tflane_jax.files.json_rows import json_rows
@@ -32,6 +32,7 @@ def scene_files(scenes: Path) -> Iterator[tuple[str, tuple[Path, ...]]]:
 
     Raises UserError for tables that are missing or damaged.
     """
+    check_tables(scenes.parent)
     logs = scenes.with_name("log.json")
     city = {_text(row, "token", logs): _text(row, "location", logs) for row in json_rows(logs)}
     others = tuple(scenes.with_name(f"{name}.json") for name in TABLES if f"{name}.json" != scenes.name)

@@ -20,7 +20,6 @@ from jaxtyping import Float
 from tflane_jax.datasets.plausible import FARTHEST
 from tflane_jax.errors import UserError
 from tflane_jax.files.fields import numbers
-from tflane_jax.files.folders import named_folder
 from tflane_jax.files.json_rows import json_rows
 from tflane_jax.files.wording import shown
 from tflane_jax.geometry import matrix_from_quaternion, pose_matrix
@@ -179,36 +178,6 @@ class Tables:
         return self.pose("calibrated_sensor", self.sensor_file(sample, channel)["calibrated_sensor_token"])
 
 
-def find_tables(root: Path, version: str | None = None) -> Path:
-    """Return the folder of the tables in the data set's folder, or `root` itself if it holds them.
-
-    Args:
-        root: of the data set.
-        version: such as "v1.0-mini"; None takes the only one, or v1.0-trainval among several.
-
-    Raises:
-        UserError: there is none, or several of which none is v1.0-trainval.
-    """
-    root = Path(root)
-    if not root.exists():
-        raise UserError(f"there is no folder {root}: name the folder of nuScenes")
-    if version is not None:
-        if not (root / version / "sample.json").is_file():
-            raise UserError(f"{root} holds no {version}/sample.json: name the data set's folder and its version")
-        return root / version
-    if (root / "sample.json").is_file():
-        return named_folder(root)  # the name tells the split, and maps lie beside it
-    found = sorted(path.parent for path in root.glob("*/sample.json"))
-    if not found:
-        raise UserError(f"{root} holds no nuScenes tables: there is no v1.0-*/sample.json in it")
-    if len(found) > 1:
-        found = [path for path in found if path.name == "v1.0-trainval"] or found
-    if len(found) > 1:
-        names = ", ".join(path.name for path in found)
-        raise UserError(f"{root} holds several versions ({names}): name one of them as the folder")
-    return found[0]
-
-
 def shared_tables(folder: Path) -> Tables:
     """Return `read_tables` of a folder; while its files stay as they are, all callers share one copy.
 
@@ -231,6 +200,16 @@ def _shared(folder: Path, files: tuple[tuple[int, int] | None, ...]) -> Tables:
     return read_tables(folder)
 
 
+def check_tables(folder: Path) -> None:
+    """Raise UserError, which names all of them, where tables are missing."""
+    missing = [f"{table}.json" for table in TABLES if not (folder / f"{table}.json").is_file()]
+    if missing:
+        raise UserError(
+            f"{folder} lacks {len(missing)} of nuScenes' {len(TABLES)} tables ({', '.join(missing)}): unpack the "
+            f"metadata archive of {folder.name} again, in {folder.parent}"
+        )
+
+
 def read_tables(folder: Path) -> Tables:
     """Read and join the tables in a folder.
 
@@ -239,6 +218,7 @@ def read_tables(folder: Path) -> Tables:
             one that does not exist; the message names the file, the row and the column.
     """
     folder = Path(folder)
+    check_tables(folder)
     rows = {}
     for table in TABLES:
         wanted = {row["ego_pose_token"] for row in rows["sample_data"].values()} if table == "ego_pose" else None

@@ -5,8 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 from tflane_jax.datasets.log_frames import KEPT_LOGS
+from tflane_jax.datasets.nuscenes_folder import find_tables
 from tflane_jax.datasets.nuscenes_log import Visibility, scene_frames, scene_log
-from tflane_jax.datasets.nuscenes_tables import find_tables, shared_tables
+from tflane_jax.datasets.nuscenes_tables import shared_tables
 from tflane_jax.datasets.recent import Recent
 from tflane_jax.errors import UserError
 from tflane_jax.scene.logs import Log
@@ -19,7 +20,7 @@ class SceneTracks:
     before its traffic flow is taken from here.
 
     Args:
-        root, version: see `nuscenes_tables.find_tables`.
+        root, version: see `nuscenes_folder.find_tables`.
         least_visibility: see `nuscenes_log.scene_log`.
 
     Raises UserError for tables that are missing or damaged.

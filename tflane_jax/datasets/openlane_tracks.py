@@ -45,7 +45,7 @@ class SourceTracks:
 
     Args:
         root: folder of the logs, as for `argoverse2_log.find_logs`, or of nuScenes, as for
-            `nuscenes_tables.find_tables`; their maps are not needed.
+            `nuscenes_folder.find_tables`; their maps are not needed.
         subset: which of the two `root` is.
         logs: name of the log of each (split, segment), see `openlane_frames.source_logs`.
 

@@ -7,8 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.datasets.nuscenes_small import write_nuscenes
+from tests.datasets.test_nuscenes_scenes import content
+from tests.datasets.test_nuscenes_scenes import write as write_scene
 from tests.shared import shared_root
 from tflane_jax.cli import main
+from tflane_jax.datasets import nuscenes, nuscenes_scenes
 from tflane_jax.datasets.base import FrameInfo
 from tflane_jax.datasets.overlap import NEAR_GROUPS, DrivenPath, frame_drives, nearness, overlap, read_drives
 from tflane_jax.errors import UserError
@@ -155,10 +159,62 @@ def test_a_folder_without_drives_is_named(tmp_path, capsys):
 
 
 def test_a_folder_of_neither_dataset_is_told_so(tmp_path):
-    with pytest.raises(UserError, match=r"holds no Argoverse 2 log: .*; nor a frame of OpenLane-V2: no <segment>/info"):
+    formats = (
+        r"name a folder of Argoverse 2 logs .*, of OpenLane-V2 .*, of nuScenes .* or of its scene files \(\*\.npz\)"
+    )
+    with pytest.raises(UserError, match=rf"holds no drive: {formats}"):
         read_drives(tmp_path)
-    with pytest.raises(UserError, match=r"^there is no \S+: name a folder"):
+    with pytest.raises(UserError, match=rf"^there is no \S+: {formats}"):
         read_drives(tmp_path / "none")
+
+
+def same_drives(found, expected):
+    for one, other in zip(found, expected, strict=True):
+        assert (one.name, one.area) == (other.name, other.area)
+        np.testing.assert_array_equal(one.positions, other.positions)
+
+
+def test_nuscenes_is_read_as_evaluation_reads_it(tmp_path):
+    root = write_nuscenes(tmp_path)
+    drives = {split: nuscenes.SOURCE.drives(nuscenes.NuScenesConfig(root, split=split)) for split in ("train", "val")}
+    assert [one.area for one in drives["train"]] == ["singapore-onenorth"]
+    same_drives(read_drives(root), drives["train"] + drives["val"])
+    for split, expected in drives.items():
+        same_drives(read_drives(root, split), expected)
+    same_drives(read_drives(root / "v1.0-mini", "val"), drives["val"])
+    with pytest.raises(UserError, match="holds no scene of nuScenes' split test: name another folder"):
+        read_drives(root, "test")
+
+
+def test_scene_files_are_read_as_evaluation_reads_them(tmp_path):
+    for name in ("scene-0061", "scene-0796"):
+        write_scene(tmp_path / f"{name}.npz", content(name))
+    config = nuscenes_scenes.SceneFileConfig(tmp_path)
+    same_drives(read_drives(tmp_path), nuscenes_scenes.SOURCE.drives(config))
+    (val,) = read_drives(tmp_path, "val")
+    assert val.name == "scene-0796"
+    assert [one.name for one in read_drives(tmp_path / "scene-0061.npz")] == ["scene-0061"]
+
+
+@pytest.mark.parametrize("files", [False, True])
+def test_one_folder_of_nuscenes_is_compared_by_its_official_splits(tmp_path, files, capsys):
+    """Of two folders, all scenes are compared: a folder with itself would be all overlap."""
+    if files:
+        for name in ("scene-0061", "scene-0796"):
+            write_scene(tmp_path / f"{name}.npz", content(name))
+    else:
+        write_nuscenes(tmp_path)
+    assert main(["data", "overlap", str(tmp_path), str(tmp_path)]) == 0
+    said = capsys.readouterr().out
+    frames = 3 if files else 2
+    assert f"fraction of {frames} validation frames (1 drives) near a training frame (1 drives)" in said
+    assert "official splits, train against val" in said
+    assert ("do not name the city" in said) == files
+    if files:
+        assert main(["data", "overlap", str(tmp_path), str(tmp_path / "scene-0061.npz")]) == 0
+        said = capsys.readouterr().out
+        assert "near a training frame (2 drives)" in said
+        assert "official splits" not in said
 
 
 def test_real_logs():

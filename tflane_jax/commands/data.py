@@ -17,7 +17,7 @@ from tflane_jax.config_overrides import apply_overrides
 from tflane_jax.datasets import sources
 from tflane_jax.datasets.base import SPLITS, IndexedExamples, spread
 from tflane_jax.datasets.batches import prepared
-from tflane_jax.datasets.overlap import overlap, read_drives
+from tflane_jax.datasets.overlap import has_official_splits, overlap, read_drives
 from tflane_jax.errors import UserError
 from tflane_jax.files.wording import counted
 from tflane_jax.plots import dataset_summary, format_table, save_camera_views, save_contact_sheet, save_table
@@ -139,7 +139,9 @@ def overlap_of_splits(options: argparse.Namespace) -> int:
     """Print the fraction of a validation split that lies near training frames."""
     if options.out is not None:
         check_table(options.out, [options.train, options.validation])
-    train, validation = read_drives(options.train), read_drives(options.validation)
+    official = options.train.resolve() == options.validation.resolve() and has_official_splits(options.train)
+    train = read_drives(options.train, "train" if official else None)
+    validation = read_drives(options.validation, "val" if official else None)
     found = overlap(train, validation)
     title = (
         f"fraction of {sum(map(len, found.distances))} validation frames ({len(validation)} drives) near a training "
@@ -148,6 +150,8 @@ def overlap_of_splits(options: argparse.Namespace) -> int:
     print(format_table(found.rows(), title=title))
     if found.worst():
         print("\n" + format_table(found.worst(), title="validation drives that overlap most"))
+    if official:
+        print("\nBoth sides are one folder: its scenes of nuScenes' official splits, train against val.")
     if any(not drive.area for drive in (*train, *validation)):
         print("\nThese files do not name the city, so places of different cities may coincide by chance.")
     if options.out is not None:

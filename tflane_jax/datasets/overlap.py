@@ -7,16 +7,21 @@ data measure the frames near training frames and the others apart (`nearness`).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from tflane_jax.datasets.argoverse2_log import city_of, find_logs
+from tflane_jax.datasets.argoverse2_log import ANNOTATIONS, city_of, find_logs, logs_within
 from tflane_jax.datasets.argoverse2_poses import read_poses
-from tflane_jax.datasets.base import IndexedExamples
+from tflane_jax.datasets.base import IndexedExamples, Split
+from tflane_jax.datasets.nuscenes_folder import find_tables, table_folders
+from tflane_jax.datasets.nuscenes_log import scene_frames
+from tflane_jax.datasets.nuscenes_scene_files import find_scene_files, scene_file_outline
+from tflane_jax.datasets.nuscenes_splits import official_split
+from tflane_jax.datasets.nuscenes_tables import shared_tables
 from tflane_jax.errors import UserError
 from tflane_jax.files.fields import load_members, member, numbers
 from tflane_jax.files.openlane import info_files
@@ -25,6 +30,10 @@ RADII = (5.0, 10.0, 20.0, 50.0)
 NEAR = 5.0
 """Up to this distance from a training frame, metres, a test frame shows a place that a model may know by heart."""
 NEAR_GROUPS = ("near training", "far from training")
+_FORMATS = (
+    f"a folder of Argoverse 2 logs (<log>/{ANNOTATIONS}), of OpenLane-V2 (<segment>/info/<timestamp>.json), of "
+    "nuScenes (v1.0-*/sample.json) or of its scene files (*.npz)"
+)
 _POSE_INTERVAL = 0.1  # seconds between the poses of a log that are compared; the files have 170 per second
 
 
@@ -44,15 +53,23 @@ class DrivenPath:
     positions: Float[np.ndarray, "f 2"]
 
 
-def read_drives(root: Path) -> list[DrivenPath]:
-    """Return the drives of a folder of Argoverse 2 logs, or of OpenLane-V2.
+def read_drives(root: Path, split: Split | None = None) -> list[DrivenPath]:
+    """Return the drives of a folder of Argoverse 2 logs, of OpenLane-V2, of nuScenes or of its scene files.
 
-    Its files, `<segment>/info/<timestamp>.json` and `<timestamp>-ls.json`, do not name the city.
+    OpenLane-V2's files, `<segment>/info/<timestamp>.json` and `<timestamp>-ls.json`, do not name the city.
+
+    Args:
+        root: the folder; or a scene file.
+        split: of a folder with `has_official_splits`, only the scenes of this one; others have no such splits.
 
     Raises:
-        UserError: the folder holds neither, or a file cannot be read.
+        UserError: the folder holds none of these, no scene of the split, or a file cannot be read.
     """
     root = Path(root)
+    if not root.exists():
+        raise UserError(f"there is no {root}: name {_FORMATS}")
+    if table_folders(root):
+        return _table_drives(root, split)
     # Where a frame has both files, which hold the same pose, the one without "-ls" is read: it sorts last.
     files = sorted(info_files(root))
     if frames := {file.with_stem(file.stem.removesuffix("-ls")): file for file in files}:
@@ -62,12 +79,46 @@ def read_drives(root: Path) -> list[DrivenPath]:
             where = numbers(member(pose, "translation", f"{file}: pose"), (3,), f"{file}: pose.translation")
             drives.setdefault(file.parent.parent, []).append(where[:2])
         return [DrivenPath(folder.name, "", np.stack(where)) for folder, where in drives.items()]
-    try:
-        logs = find_logs(root)
-    except UserError as error:
-        also = "; nor a frame of OpenLane-V2: no <segment>/info/<timestamp>.json" if root.is_dir() else ""
-        raise UserError(f"{error}{also}") from None
-    return [_log_drive(folder) for folder in logs]
+    if logs_within(root):
+        return [_log_drive(folder) for folder in find_logs(root)]
+    if _has_scene_files(root):
+        found = {path.stem: path for path in find_scene_files(root)}
+        return [_scene_drive(found[name]) for name in _of_split(root, found, split, mini=False)]
+    raise UserError(f"{root} holds no drive: name {_FORMATS}")
+
+
+def has_official_splits(root: Path) -> bool:
+    """Return whether a folder holds nuScenes or scene files of it: names of scenes tell their official split."""
+    return bool(table_folders(root)) or (_has_scene_files(root) and not any(info_files(root)) and not logs_within(root))
+
+
+def _has_scene_files(root: Path) -> bool:
+    return any(root.glob("*.npz")) or (root.is_file() and root.suffix == ".npz")
+
+
+def _of_split(root: Path, names: Iterable[str], split: Split | None, *, mini: bool) -> list[str]:
+    """Return the scenes of an official split of nuScenes, or all, by name."""
+    found = sorted(name for name in names if split in (None, official_split(name, mini=mini)))
+    if split is not None and not found:
+        raise UserError(
+            f"{root}, named on both sides, holds no scene of nuScenes' split {split}: name another folder on one side"
+        )
+    return found
+
+
+def _table_drives(root: Path, split: Split | None) -> list[DrivenPath]:
+    tables = shared_tables(find_tables(root))
+    scenes, drives = tables.scenes(), []
+    for name in _of_split(root, scenes, split, mini=tables.mini):
+        frames = scene_frames(tables, scenes[name])
+        drives.append(DrivenPath(name, tables.location(scenes[name]), frames.global_from_frame[:, :2, 3]))
+    return drives
+
+
+def _scene_drive(path: Path) -> DrivenPath:
+    outline = scene_file_outline(path)
+    where = [moment.global_from_ego[:2, 3] for moment in outline.keyframes]
+    return DrivenPath(outline.name, outline.area, np.stack(where))
 
 
 def _log_drive(folder: Path) -> DrivenPath:

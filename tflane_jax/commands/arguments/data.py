@@ -144,9 +144,17 @@ def _overlap(inner) -> None:
         function="overlap_of_splits",
     )
     overlap.add_argument(
-        "train", metavar="TRAIN", type=Path, help="folder of Argoverse 2 logs, or of OpenLane-V2 segments"
+        "train",
+        metavar="TRAIN",
+        type=Path,
+        help="folder of Argoverse 2 logs, of OpenLane-V2 segments, of nuScenes or of its scene files (npz)",
     )
-    overlap.add_argument("validation", metavar="VALIDATION", type=Path, help="the same for the validation split")
+    overlap.add_argument(
+        "validation",
+        metavar="VALIDATION",
+        type=Path,
+        help="the same for the validation split; of nuScenes, the same folder stands for the official splits",
+    )
     overlap.add_argument("--out", metavar="STEM", type=stem, help="write STEM.md and STEM.json")
 
 

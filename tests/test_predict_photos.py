@@ -29,7 +29,7 @@ class Reader:
         lane = np.array([[1.0, 10.0], [2.0, 20.0]])
         if photo.shape[1] == 77:
             raise KeyboardInterrupt
-        return PhotoLanes(fit_photo(photo, camera).placement, (lane,), (0.9,), (0.5,), 0.3, "")
+        return PhotoLanes(fit_photo(photo, camera).placement, (lane,), (0.9,), (0.5,), 0.3, "", 0.2)
 
 
 @pytest.fixture
@@ -65,6 +65,7 @@ def test_files_that_cannot_be_read_are_recorded_and_the_others_predicted(predict
     faults = {record["file"]: record["error"] for record in found["faults"]}
     assert list(faults) == [str(tmp_path / name) for name in ("bad.jpg", "low.png", "drive.mp4")]
     assert "row 30, is below a photo 20 pixels high" in faults[str(tmp_path / "low.png")]
+    assert [(record["value"], record["needed"]) for record in found["photos"]] == [(0.3, 0.2)] * 2
     assert (found["videos"], found["complete"]) == ([], True)
     told = capsys.readouterr()
     assert "2 lane lines in 2 photos" in told.out

@@ -71,7 +71,7 @@ def test_the_view_is_found_in_which_the_lanes_meet_on_the_horizon(network):
     horizon = TRUE.top + HORIZON * TRUE.height
     assert found.view.top + HORIZON * found.view.height == pytest.approx(horizon, abs=12)
     assert len(found.lanes) >= 2
-    assert found.warning == ""
+    assert (found.warning, found.needed) == ("", 0.72)
     for points in found.lanes:
         u, v = points.T
         assert v.min() >= horizon - 12
@@ -83,7 +83,7 @@ def test_tusimples_own_view_needs_no_search(network, monkeypatch):
     whole = Placement(0, 0, 1280, 720)
     monkeypatch.setitem(globals(), "TRUE", whole)
     found = reader().read(photo(whole, (720, 1280)))
-    assert (found.view, found.warning, len(found.lanes)) == (whole, "", 4)
+    assert (found.view, found.warning, len(found.lanes), found.needed) == (whole, "", 4, 0.2)
     assert set(network["views"]) == {whole}
 
 
@@ -96,7 +96,7 @@ def test_a_portrait_is_searched_however_plausible_it_looks(network, monkeypatch)
 
 
 def test_a_known_camera_is_not_searched(network):
-    reader().read(photo(), PhotoCamera(horizon=449))
+    assert reader().read(photo(), PhotoCamera(horizon=449)).needed is None
     assert len(set(network["views"])) == 1
     with pytest.raises(UserError, match="below a photo"):
         reader().read(photo(), PhotoCamera(horizon=900))
@@ -130,7 +130,8 @@ def test_empty_photos_have_no_lanes(network, value):
 def test_lanes_without_paint_are_a_warning(network):
     bare = np.repeat(np.tile(np.linspace(60, 200, 1600).astype(np.uint8), (900, 1))[..., None], 3, -1)
     found = reader().read(bare)
-    assert found.lanes == ()
+    assert (found.lanes, found.needed) == ((), 0.72)
+    assert found.value < found.needed
     assert found.warning.startswith("no lanes: no part of the photo shows any that meet")
     assert "--horizon" in found.warning
     assert reader().find_view([bare]) is None

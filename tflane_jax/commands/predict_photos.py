@@ -2,13 +2,15 @@
 
 predictions.json, and one picture or video (MP4) for each input:
     {"model", "step", "threshold", "complete",
-     "photos": [{"file", "width", "height", "picture", "view", "value", "warning", "lanes": LANES}, ...],
+     "photos": [{"file", "width", "height", "picture", "view", "value", "needed", "warning", "lanes": LANES}, ...],
      "videos": [{"file", "width", "height", "rate", "video", "view", "warning", "frames": [LANES, ...]}, ...],
      "faults": [{"file", "error"}, ...]}
     LANES is [{"score", "paint", "points": [[column, row], ...]}, ...]: pixels, from the upper end of a lane to the
     lower end; lanes are in order from left to right. `paint` is the fraction of the lane that lies on paint, `view` the
     part of the photo that the network saw ({"left", "top", "width", "height"}; `top` is negative where black rows were
-    added), `value` its plausibility. `faults` are files that could not be read or that the camera does not fit;
+    added), `value` its plausibility and `needed` from which value it is taken: one limit for the whole photo, seen
+    without a search, another for one of the searched views, whose values are of another scale; null where the camera's
+    horizon is known or the photo is empty. `faults` are files that could not be read or that the camera does not fit;
     `complete` is false until all others are done.
 """
 
@@ -151,8 +153,8 @@ def _photo(reader: PhotoReader, path: Path, out: Path, camera: PhotoCamera | Non
     save_photo(out, photo, answer.lanes, f"{path.name}: {counted(count, 'lane line')}")
     height, width = photo.shape[:2]
     size = {"file": str(path), "width": width, "height": height}
-    found = {"view": _plain_view(answer.view), "value": round(answer.value, 3), "warning": answer.warning}
-    return size | {"picture": out.name} | found | {"lanes": _plain(answer)}
+    found = {"view": _plain_view(answer.view), "value": round(answer.value, 3), "needed": answer.needed}
+    return size | {"picture": out.name} | found | {"warning": answer.warning, "lanes": _plain(answer)}
 
 
 def _video(reader: PhotoReader, path: Path, out: Path, camera: PhotoCamera | None, so_far: SoFar) -> dict[str, Any]:

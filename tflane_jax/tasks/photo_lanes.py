@@ -8,7 +8,7 @@ not cross, lie on paint, reach far, and are those that most other cuts show (`ev
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import jax
 import numpy as np
@@ -61,8 +61,10 @@ class PhotoLanes:
         lanes: (column, row) in pixels of the photo, from the upper to the lower end; from left to right.
         scores: of the lanes, 0 to 1.
         paint: fraction of each lane that lies on paint.
-        value: plausibility of the view: of one of many `plausibility`, otherwise that of `Judgement`.
+        value: plausibility of the view: of one of many `plausibility`, otherwise that of `Judgement`. The two are no
+            numbers to compare.
         warning: what is doubtful; "" if nothing is.
+        needed: from which value the view is taken; None without a choice: the view was given, or the photo is empty.
     """
 
     view: Placement
@@ -71,6 +73,7 @@ class PhotoLanes:
     paint: tuple[float, ...]
     value: float
     warning: str
+    needed: float | None = None
 
 
 @dataclass(frozen=True)
@@ -101,12 +104,14 @@ class _Choice:
         value: its plausibility.
         bounds: from which value it is taken at all, and without a warning.
         believed: which lanes are.
+        needed: see `PhotoLanes`.
     """
 
     seen: _ViewLanes
     value: float
     bounds: tuple[float, float]
     believed: Bool[np.ndarray, " l"]
+    needed: float | None = None
 
 
 class PhotoReader:
@@ -165,7 +170,7 @@ class PhotoReader:
         height, width = grey.shape
         whole = self._in_view(photo, grey, fit_photo(photo, PhotoCamera(focal)).placement)
         if whole.judged.value >= _SURE and is_alike(width, height):
-            return self._given(photo, grey, whole)
+            return replace(self._given(photo, grey, whole), needed=_SURE)
         tried = {whole.view: whole}
         for horizon in _HORIZONS:
             self._try(tried, photo, grey, PhotoCamera(focal, horizon * height))
@@ -181,7 +186,7 @@ class PhotoReader:
         value, best = max(((_rated(one, tried, photo), one) for one in tried.values()), key=lambda pair: pair[0])
         seen = self._asked(photo, grey, best)
         believed = (_agreed(seen, tried, photo) >= _AGREED) | np.array(seen.judged.supported, bool)
-        return _Choice(seen, value, _OF_MANY, believed)
+        return _Choice(seen, value, _OF_MANY, believed, needed=_OF_MANY[0])
 
     def _try(self, tried: dict[Placement, _ViewLanes], photo, grey, camera: PhotoCamera) -> None:
         if camera.horizon is not None and camera.horizon <= 1.0:
@@ -225,7 +230,7 @@ class PhotoReader:
         """
         seen, judged, (least, plausible) = choice.seen, choice.seen.judged, choice.bounds
         if choice.value < least:
-            return PhotoLanes(seen.view, (), (), (), choice.value, _NOTHING)
+            return PhotoLanes(seen.view, (), (), (), choice.value, _NOTHING, choice.needed)
         # Lanes meet above their view's horizon where the road rises. Those of a known camera may be nearly parallel and
         # meet anywhere.
         top = seen.view.top + HORIZON * seen.view.height if horizon is None else horizon
@@ -257,6 +262,7 @@ class PhotoReader:
             tuple(judged.paint[kept[k]] for k in shown),
             choice.value,
             "; ".join(warnings),
+            choice.needed,
         )
 
 

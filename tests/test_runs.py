@@ -72,6 +72,31 @@ def test_a_start_from_another_model_is_told_before_data_are_read(config, tmp_pat
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.parametrize(
+    ("reference", "kind", "remedy"),
+    [
+        ("gtn_lane/gtn", "LstrConfig", ": name a run of TopoNetConfig"),
+        (
+            "tf_lane/lanesegnet",
+            "LaneSegNetConfig",
+            r": name a run of TopoNetConfig; training.init_partly takes over the 30 of 1,000 parameters \(3 %\) that "
+            "both have, and the others start at random",
+        ),
+    ],
+)
+def test_a_run_of_another_class_of_models_is_named_as_such(config, reference, kind, remedy, tmp_path, monkeypatch):
+    """Regression: the advice was init_partly, with which almost all would have started at random."""
+    write_weights(load_config(reference), {"scale": jnp.ones(30)}, tmp_path / "origin")
+    new = {"more": jnp.ones(970), "scale": jnp.ones(30)}
+    monkeypatch.setattr(LaneGraphTask, "init", lambda task, key, example: new)
+    monkeypatch.setattr(LaneGraphTask, "load", None)
+    tuned = replace(config, training=replace(config.training, init_from=str(tmp_path / "origin")))
+    with pytest.raises(
+        UserError, match=rf"origin is a run of {kind}, not of TopoNetConfig \(more is only here\){remedy}$"
+    ):
+        train_run(tuned, tmp_path / "run", progress=False)
+
+
 def test_a_run_that_is_overwritten_is_none_to_start_from(config, tmp_path):
     """Regression: it was deleted first, and no checkpoint was left if the training ended before its own first one."""
     folder, link = tmp_path / "run_0", tmp_path / "link_0"

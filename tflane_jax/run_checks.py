@@ -118,8 +118,14 @@ def check_origin_model(config: RunConfig) -> None:
     """
     training = config.training
     if training.init_from is not None and (shapes := _known_shapes(config)) is not None:
-        partly, frozen = training.init_partly, config.task.frozen
-        check_origin_params(training.init_from, shapes, training.seeds, partly=partly, frozen=frozen)
+        check_origin_params(
+            training.init_from,
+            shapes,
+            training.seeds,
+            resolved=to_json(config),
+            partly=training.init_partly,
+            frozen=config.task.frozen,
+        )
 
 
 def _known_shapes(config: RunConfig) -> Any:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ import numpy as np
 from flax.traverse_util import unflatten_dict
 
 from tflane_jax.errors import UserError
-from tflane_jax.migrations import migrate
+from tflane_jax.migrations import migrate, value_at
 from tflane_jax.models.parameters import Params
 from tflane_jax.startup import write
 from tflane_jax.training.array_files import flat
@@ -47,11 +48,21 @@ def starting_params(
 
 
 def check_origin_params(
-    reference: str, shapes: Params, seeds: Sequence[int], *, partly: bool, frozen: Sequence[str]
+    reference: str,
+    shapes: Params,
+    seeds: Sequence[int],
+    *,
+    resolved: dict[str, Any],
+    partly: bool,
+    frozen: Sequence[str],
 ) -> None:
-    """Raise UserError as `starting_params` does, given the shapes of the fresh parameters."""
+    """Raise UserError as `starting_params` does, given the shapes of the fresh parameters.
+
+    With the configuration (JSON) of the new run, `resolved`, the message names both models if their classes differ.
+    """
     for folder, seed in zip(origin_folders(reference, seeds), seeds, strict=True):
-        _differences(folder, _saved(folder, seed), flat(shapes), partly=partly, frozen=frozen)
+        kinds = _kind(migrate(read_config(folder))[0]), _kind(resolved)
+        _differences(folder, _saved(folder, seed), flat(shapes), partly=partly, frozen=frozen, kinds=kinds)
 
 
 def check_origins(reference: str, seeds: Sequence[int]) -> None:
@@ -124,30 +135,62 @@ def _saved(folder: Path, seed: int) -> dict[str, Any]:
 
 
 def _differences(
-    folder: Path, saved: Mapping[str, Any], wanted: Mapping[str, Any], *, partly: bool, frozen: Sequence[str]
+    folder: Path,
+    saved: Mapping[str, Any],
+    wanted: Mapping[str, Any],
+    *,
+    partly: bool,
+    frozen: Sequence[str],
+    kinds: tuple[_Kind, _Kind] = (("", ""), ("", "")),
 ) -> tuple[list[str], list[str]]:
-    """Return the names of parameters that only the new model has, and only the run's; raise UserError for a misfit."""
+    """Return the names of parameters that only the new model has, and only the run's; raise UserError for a misfit.
+
+    Args:
+        folder: of the run to start from.
+        saved, wanted: its parameters and those of the new model, by name.
+        partly, frozen: see `starting_params`.
+        kinds: of the run and of the new one, where they are known.
+    """
+    (their_task, theirs), (our_task, ours) = kinds
+    other = f"training.init_from: {folder} holds another model"
+    instead = ""
+    if theirs and theirs != ours:
+        other, instead = f"training.init_from: {folder} is a run of {theirs}, not of {ours}", f": name a run of {ours}"
     for name in sorted(saved.keys() & wanted.keys()):
         if _shape(saved[name]) != _shape(wanted[name]):
-            raise UserError(
-                f"training.init_from: {folder} holds another model ({name}: {_shape(saved[name])} there, "
-                f"{_shape(wanted[name])} here)"
-            )
+            raise UserError(f"{other} ({name}: {_shape(saved[name])} there, {_shape(wanted[name])} here){instead}")
     added, dropped = sorted(wanted.keys() - saved.keys()), sorted(saved.keys() - wanted.keys())
+    if len(added) == len(wanted):
+        raise UserError(f"{other}, with no parameter of this one{instead}")
     if (added or dropped) and not partly:
         where = "is only here" if added else "is only there"
-        raise UserError(
-            f"training.init_from: {folder} holds another model ({(added or dropped)[0]} {where}); "
-            "training.init_partly takes over what both have"
-        )
-    if len(added) == len(wanted):
-        raise UserError(f"training.init_from: {folder} holds another model, with no parameter of this one")
+        total, common = _count(wanted, wanted), _count(wanted, wanted.keys() - set(added))
+        if their_task == our_task:
+            fraction = f"{common:,} of {total:,} parameters ({100 * common / total:.0f} %)"
+            instead += f"; training.init_partly takes over the {fraction} that both have"
+            instead += ", and the others start at random" * bool(added)
+        raise UserError(f"{other} ({(added or dropped)[0]} {where}){instead}")
     for module in frozen:
         if any(name.startswith(f"{module}/") for name in added):
             raise UserError(
                 f"training.init_from: {folder} has no {module}, which this configuration freezes: it would stay random"
             )
     return added, dropped
+
+
+_Kind = tuple[str, str]
+"""Names of the classes of a task and of its model; "" where they are not known."""
+
+
+def _kind(config: Mapping[str, Any]) -> _Kind:
+    """Return the classes that a configuration (JSON) names."""
+    task, model = (value_at(config, name) for name in ("task.class", "task.model.class"))
+    return (task, model) if isinstance(task, str) and isinstance(model, str) else ("", "")
+
+
+def _count(params: Mapping[str, Any], names: Iterable[str]) -> int:
+    """Return how many numbers the named parameters hold."""
+    return sum(math.prod(params[name].shape) for name in names)
 
 
 def _shape(leaf: jax.Array) -> tuple[tuple[int, ...], str]:

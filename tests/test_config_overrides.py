@@ -13,7 +13,7 @@ import tyro
 from tflane_jax.commands import train
 from tflane_jax.config import OpenLaneV2Data, RunConfig, epochs_of, load_config
 from tflane_jax.config_io import from_json, settings, to_json
-from tflane_jax.config_overrides import _without_boxes, apply_overrides, batch_notices
+from tflane_jax.config_overrides import _without_boxes, apply_overrides, batch_notices, unread_notices
 from tflane_jax.errors import UserError
 from tflane_jax.markers.simulation import MarkerConfig, MarkerSimulationConfig
 from tflane_jax.models.marker_fusion import MarkerFusionConfig
@@ -233,3 +233,29 @@ def test_what_another_batch_trains_is_told():
     assert "sees 0.25 times as many examples. --training.same-examples" in notice
     for known in ([], ["--training.batch-size", "16", SAME], ["--training.batch-size", "16", "--training.steps", "9"]):
         assert batch_notices(RESNET, apply_overrides(RESNET, [*known, "--optim.warmup-steps", "3"])) == []
+
+
+MAP, MARKERS = ["--data.example.sd-map", "default"], ["--data.example.markers", "default"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (MAP, ["examples have an SD map (data.example.sd_map), which no prior of this model "]),
+        (MARKERS, ["examples have markers (data.example.markers), "]),
+        ([*MAP, *MARKERS, "--task.model.priors.markers", "default"], ["examples have an SD map "]),
+        ([*MAP, "--task.model.priors.sd-map", "default"], []),
+        ([], []),
+    ],
+)
+def test_examples_with_what_the_model_does_not_read_are_told(arguments, told, tmp_path, capsys):
+    train._config(argparse.Namespace(config="tf_lane/toponet"), tmp_path, arguments)
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == len(told)
+    assert all(line.startswith(start) for line, start in zip(lines, told, strict=True))
+
+
+def test_a_control_that_is_shipped_with_examples_of_other_models_is_not_told():
+    control, images = load_config("markers/toponet_markers:toponet"), load_config("gtn_lane/gtn")
+    assert unread_notices(control, apply_overrides(control, ["--optim.lr", "0.5"])) == []
+    assert unread_notices(images, images) == []

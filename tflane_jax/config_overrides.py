@@ -19,6 +19,8 @@ from tflane_jax.config_io import choices, settings, with_setting
 from tflane_jax.errors import UserError
 from tflane_jax.limits import allowed_for, check_settings
 from tflane_jax.own_modules import is_own
+from tflane_jax.tasks.fit import unread_priors
+from tflane_jax.tasks.lane_graph import LaneGraphTask
 
 # Settings by their names in other programs.
 _SYNONYMS = {
@@ -34,6 +36,7 @@ _NO_NUMBER = re.compile(
 # tyro's messages about several values of which one is wrong, and about arguments that no option takes.
 _NO_PARSE = re.compile(r"Error parsing (--\S+): Could not find valid parse for arguments: (\[.*\])")
 _LEFT_OVER = "Unrecognized options: "
+_IN_WORDS = {"sd_map": "an SD map", "markers": "markers"}
 
 
 def apply_overrides(config: RunConfig, arguments: Sequence[str]) -> RunConfig:
@@ -110,6 +113,26 @@ def batch_notices(config: RunConfig, changed: RunConfig) -> list[str]:
         f"{after / before:.4g} times as many examples{epochs}. --training.same-examples keeps their number: it divides "
         "the settings that count updates (docs/scale.md)"
     ]
+
+
+def unread_notices(config: RunConfig, changed: RunConfig) -> list[str]:
+    """Return what to say of overrides that give examples an SD map or markers and the model no prior that reads them.
+
+    Configurations that have them unread are left alone: they are controls on the same examples.
+    """
+    before = _unread(config)
+    return [
+        f"examples have {_IN_WORDS[name]} (data.example.{name}), which no prior of this model reads: "
+        f"--task.model.priors.{name.replace('_', '-')} default adds one"
+        for name in _unread(changed)
+        if name not in before
+    ]
+
+
+def _unread(config: RunConfig) -> list[str]:
+    if not isinstance(config.task, LaneGraphTask):
+        return []
+    return unread_priors(config.task.model, config.data.source("train").example)
 
 
 def _choose_parts(config: RunConfig, arguments: Sequence[str]) -> tuple[RunConfig, list[str]]:

@@ -18,7 +18,7 @@ from tflane_jax.config import RunConfig, load_config
 from tflane_jax.config_files import split_reference
 from tflane_jax.config_help import explained
 from tflane_jax.config_io import from_json, to_json
-from tflane_jax.config_overrides import apply_overrides, batch_notices
+from tflane_jax.config_overrides import apply_overrides, batch_notices, unread_notices
 from tflane_jax.errors import UserError
 from tflane_jax.files.wording import counted
 from tflane_jax.own_modules import imports_of
@@ -98,8 +98,9 @@ def _config(options: argparse.Namespace, out: Path, overrides: Sequence[str]) ->
         with processes.agreed():
             config = load_config(options.config)
             changed = apply_overrides(config, overrides)
-        for notice in batch_notices(config, changed) if processes.is_first() else ():
-            write(notice)
+        for notice in (*batch_notices(config, changed), *unread_notices(config, changed)):
+            if processes.is_first():
+                write(notice)
         return changed
     if overrides:
         raise UserError(

@@ -25,6 +25,8 @@ from tflane_jax.scene import BevChannel, Example
 
 _BORDER = 0.1
 """Metres by which a point may lie outside a range, for rounding."""
+_OPTIONAL_PRIORS = ("sd_map", "markers")
+"""Fields of `ExampleConfig`, `Example` and `PriorsConfig` that are None by default."""
 
 
 def check_settings_fit(model: HostConfig, config: ExampleConfig, *, image_scale: float | None) -> None:
@@ -127,6 +129,12 @@ def frozen_modules(model: HostConfig) -> tuple[str, ...]:
     return tuple(f"encoder/images/backbone/{part}" for part in parts[: encoder.images.frozen_stages])
 
 
+def unread_priors(model: HostConfig, config: ExampleConfig) -> list[str]:
+    """Return the names of the priors that examples have by a setting of their own and no prior of the host reads."""
+    read = {name for prior in model.build_priors().values() for name in prior.reads}
+    return [name for name in _OPTIONAL_PRIORS if getattr(config, name) is not None and name not in read]
+
+
 def reads_traffic(model: HostConfig) -> bool:
     """Return whether the host reads traffic flow; the matched control, which reads no instances, does not."""
     traffic = model.priors.traffic_flow
@@ -199,7 +207,7 @@ def _check_inputs(model: HostConfig, config: ExampleConfig, *, images: bool) -> 
             "this model reads camera images (task.model.encoder), and the data have none: set data.example.cameras "
             "(built-in world) or data.image (nuScenes)"
         )
-    for name in ("sd_map", "markers"):
+    for name in _OPTIONAL_PRIORS:
         if getattr(model.priors, name) is not None and getattr(config, name) is None:
             raise UserError(
                 f"this model reads a prior (task.model.priors.{name}), and data.example.{name} is None: set that one "

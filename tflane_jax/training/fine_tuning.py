@@ -161,7 +161,7 @@ def _differences(
             raise UserError(f"{other} ({name}: {_shape(saved[name])} there, {_shape(wanted[name])} here){instead}")
     added, dropped = sorted(wanted.keys() - saved.keys()), sorted(saved.keys() - wanted.keys())
     if len(added) == len(wanted):
-        raise UserError(f"{other}, with no parameter of this one{instead}")
+        raise UserError(f"{other} (it has no parameter of this one){instead}")
     if (added or dropped) and not partly:
         where = "is only here" if added else "is only there"
         total, common = _count(wanted, wanted), _count(wanted, wanted.keys() - set(added))

@@ -182,7 +182,7 @@ _Kind = tuple[str, str]
 """Names of the classes of a task and of its model; "" where they are not known."""
 
 
-def _kind(config: Mapping[str, Any]) -> _Kind:
+def _kind(config: dict[str, Any]) -> _Kind:
     """Return the classes that a configuration (JSON) names."""
     task, model = (value_at(config, name) for name in ("task.class", "task.model.class"))
     return (task, model) if isinstance(task, str) and isinstance(model, str) else ("", "")

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from tflane_jax.geometry.polylines import line_sizes
 from tflane_jax.metrics.frames import Lines, checked_lines
 
 # Allows for the rounding of bound and distance, metres.
@@ -38,7 +39,7 @@ class PaddedLines:
     @classmethod
     def of(cls, lines: Lines, what: str, dims: int = 3) -> PaddedLines:
         """Return the lines, padded; raise UserError, beginning with `what`, for lines without points or not finite."""
-        return cls(checked_lines(lines, what, dims), np.fromiter(map(len, lines), int, len(lines)))
+        return cls(checked_lines(lines, what, dims), line_sizes(lines))
 
     def __len__(self) -> int:
         return len(self.points)

@@ -130,7 +130,7 @@ def checked_edges(edges: Any, shape: tuple[int, ...], what: str) -> Bool[np.ndar
     """Return true relations as flags; raise UserError for another shape or a number that is neither 0 nor 1."""
     edges = np.asarray(edges)
     check_shape(edges, shape, what)
-    if not np.isin(edges, (0, 1)).all():
+    if edges.dtype != bool and ((edges != 0) & (edges != 1)).any():
         raise UserError(f"{what} holds a number that is neither 0 nor 1")
     return edges.astype(bool)
 

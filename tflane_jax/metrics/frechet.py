@@ -19,9 +19,11 @@ def end_distance(a: Float[np.ndarray, "a n d"], b: Float[np.ndarray, "b m d"]) -
     It bounds the Fréchet distance from below.
     """
     # Differences, not |a|^2 + |b|^2 - 2ab: that form loses the distances that lie exactly on a threshold.
-    step = a[:, None, [0, -1]] - b[None, :, [0, -1]]
-    squared = sum((step[..., axis] ** 2 for axis in range(step.shape[-1])), start=np.zeros(()))
-    return np.sqrt(squared).max(-1)
+    squared = [
+        sum(((a[:, None, end, axis] - b[:, end, axis]) ** 2 for axis in range(a.shape[-1])), start=np.zeros(()))
+        for end in (0, -1)
+    ]
+    return np.sqrt(np.maximum(*squared))
 
 
 def pair_frechet(

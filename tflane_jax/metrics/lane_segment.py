@@ -64,11 +64,11 @@ class LaneSegmentMetrics:
 
     def update(self, detections: SegmentDetections, truth: SegmentTruth) -> None:
         """Add one frame; raise UserError for arrays that do not fit together."""
-        self.add(match_segments(detections, truth))
+        self.add(match_segments(detections, truth, elements=self.flavour == "OpenLane-V2"))
 
     def match(self, detections: SegmentDetections, truth: SegmentTruth) -> MatchedSegments:
         """Match one frame for groups, with the nearest segment of every detection, however far; raises as `update`."""
-        return match_segments(detections, truth, nearest="all")
+        return match_segments(detections, truth, nearest="all", elements=self.flavour == "OpenLane-V2")
 
     def add(self, frame: MatchedSegments) -> None:
         """Add one frame that has been matched."""

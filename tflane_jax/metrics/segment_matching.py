@@ -7,7 +7,7 @@ definition; docs/metrics.md gives the one used here.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -148,22 +148,25 @@ class MatchedSegments:
 
 
 def match_segments(
-    detections: SegmentDetections, truth: SegmentTruth, *, nearest: Nearest = "close"
+    detections: SegmentDetections, truth: SegmentTruth, *, nearest: Nearest = "close", elements: bool = True
 ) -> MatchedSegments:
     """Match the segments, areas and traffic elements of one frame; raise UserError for arrays that do not fit.
 
-    Groups of segments need the `nearest` segment of "all" detections, see `nearest_segments`.
+    Groups of segments need the `nearest` segment of "all" detections, see `nearest_segments`. Without `elements`,
+    traffic elements are ignored.
     """
     check_kinds(detections, truth, (SegmentDetections, SegmentTruth))
-    true = [truth.lanes.points, truth.left, truth.right]
-    found = [detections.lanes.points, detections.left, detections.right]
-    distance, owner = nearest_segments(true, found, nearest=nearest)
-    matched = match_lanes(detections.lanes, truth.lanes, distance, owner)
+    distance, owner, chamfer = _measured_segments(
+        [truth.lanes.points, truth.left, truth.right],
+        [detections.lanes.points, detections.left, detections.right],
+        nearest,
+    )
+    lanes = truth.lanes if elements else replace(truth.lanes, elements=None)
+    matched = match_lanes(detections.lanes, lanes, distance, owner)
     pairs = np.flatnonzero(matched.hits.any(0))
     error = np.zeros(len(distance))
-    for lines, others in zip(true, found, strict=True):
-        a, b = PaddedLines.of(lines, "truth").open_ends(), PaddedLines.of(others, "detections")
-        error[pairs] += pair_chamfer(a, b, owner[pairs], pairs) / 3.0
+    for apart in chamfer:
+        error[pairs] += apart[owner[pairs], pairs] / 3.0
     areas = match_areas(detections.areas, truth.areas)
     return MatchedSegments(matched, areas, error, _wrong_types(detections, truth, owner, pairs))
 
@@ -219,6 +222,17 @@ def nearest_segments(
         nearest: of detections that are 3 m or more from every segment: "close" leaves the index arbitrary, "all" finds
             it by the same distance of a few points on each line, without the bound on centerlines.
     """
+    least, owner, _ = _measured_segments(truth, detected, nearest)
+    return least, owner
+
+
+def _measured_segments(
+    truth: list[Lines], detected: list[Lines], nearest: Nearest
+) -> tuple[Float[np.ndarray, " p"], Int[np.ndarray, " p"], Float[np.ndarray, "3 g p"]]:
+    """Return what `nearest_segments` does, and the Chamfer distances of centerlines, left and right lines, metres.
+
+    These are arbitrary for pairs that are never matched.
+    """
     true, found = (
         [PaddedLines.of(lines, f"{side}: {name}") for lines, name in zip(three, _NAMES, strict=True)]
         for side, three in (("truth", truth), ("detections", detected))
@@ -235,14 +249,16 @@ def nearest_segments(
     lane, detection = np.nonzero(0.5 * relax[:, None] * end_distance(true_centers, centers) < LANE_THRESHOLDS[-1])
     true = [lines.open_ends() for lines in true]
     center, left, right = (pair_chamfer(a, b, lane, detection) for a, b in zip(true, found, strict=True))
+    chamfer = np.zeros((3, len(true[0]), len(found[0])))
+    chamfer[:, lane, detection] = center, left, right
     total = pair_frechet(true_centers, centers, lane, detection) + left + right
-    distance = np.full((len(true[0]), len(found[0])), np.inf)
+    distance = np.full(chamfer.shape[1:], np.inf)
     distance[lane, detection] = np.where(relax[lane] * center < LANE_THRESHOLDS[-1], relax[lane] * 0.5 * total, np.inf)
     least, owner = nearest_truth(distance)
     far = np.flatnonzero(least >= LANE_THRESHOLDS[-1])
     if nearest == "all" and len(far) and len(relax):
         owner[far] = _nearest_of_all(relax, true, [lines.select(far) for lines in found])
-    return least, owner
+    return least, owner, chamfer
 
 
 def _nearest_of_all(

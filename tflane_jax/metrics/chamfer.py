@@ -20,7 +20,7 @@ _SLACK = 1e-9
 # The bound cuts a line into at most _PIECES pieces of at least _PIECE vertices.
 _PIECES, _PIECE = 10, 4
 # Squared distances computed at a time, so that they fit into the processor's cache.
-_BLOCK = 2**16
+_BLOCK = 2**15
 
 
 @dataclass(frozen=True)
@@ -121,10 +121,11 @@ def pair_chamfer(
     counted_a, counted_b = a.counted(), b.counted()
     for block in _blocks(len(i), a.points.shape[1] * b.points.shape[1]):
         left, right = i[block], j[block]
-        squared = _squared(a.points[left], b.points[right])
-        forth = (np.sqrt(squared.min(2)) * counted_a[left]).sum(-1) / a.counts[left]
-        back = (np.sqrt(squared.min(1)) * counted_b[right]).sum(-1) / b.counts[right]
-        distance[block] = 0.5 * (forth + back)
+        squared = _squared(_coordinates(a, left), _coordinates(b, right))
+        # Contiguous, so that the order of a sum does not depend on the number of pairs.
+        forth = np.sqrt(np.ascontiguousarray(squared.min(2))) * counted_a[left]
+        back = np.sqrt(np.ascontiguousarray(squared.min(1))) * counted_b[right]
+        distance[block] = 0.5 * (forth.sum(-1) / a.counts[left] + back.sum(-1) / b.counts[right])
     return distance
 
 
@@ -162,12 +163,20 @@ def _gap(
     return np.sqrt(step.sum(0))
 
 
-def _squared(a: Float[np.ndarray, "k n d"], b: Float[np.ndarray, "k m d"]) -> Float[np.ndarray, "k n m"]:
+def _coordinates(lines: PaddedLines, chosen: Int[np.ndarray, " k"]) -> Float[np.ndarray, "d k n"]:
+    """Return the coordinates of some lines, in memory along the longer of the axes k and n: numpy's inner loop."""
+    points = lines.points[chosen]
+    if len(points) > points.shape[1]:
+        return np.ascontiguousarray(points.transpose(2, 1, 0)).swapaxes(1, 2)
+    return np.ascontiguousarray(points.transpose(2, 0, 1))
+
+
+def _squared(a: Float[np.ndarray, "d k n"], b: Float[np.ndarray, "d k m"]) -> Float[np.ndarray, "k n m"]:
     # In place, one coordinate at a time: memory traffic dominates the time.
-    total = a[:, :, None, 0] - b[:, None, :, 0]
+    total = a[0, :, :, None] - b[0, :, None]
     total *= total
-    for axis in range(1, a.shape[-1]):
-        step = a[:, :, None, axis] - b[:, None, :, axis]
+    for first, second in zip(a[1:], b[1:], strict=True):
+        step = first[:, :, None] - second[:, None]
         step *= step
         total += step
     return total

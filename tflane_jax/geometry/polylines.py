@@ -103,7 +103,7 @@ def pad_lines(
     sizes = line_sizes(lines)
     if sizes.min() == 0:
         raise ValueError(f"polyline {int(sizes.argmin())} has no points")
-    if (sizes == sizes[0]).all():
+    if sizes.min() == sizes.max():
         return np.asarray(lines, np.float64)
     first = np.cumsum(sizes) - sizes
     index = first[:, None] + np.minimum(np.arange(sizes.max()), sizes[:, None] - 1)

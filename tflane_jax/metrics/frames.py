@@ -97,8 +97,9 @@ def checked_lines(lines: Lines, what: str, dims: int = 3) -> Float[np.ndarray, "
     if points.ndim != 3 or points.shape[-1] != dims:
         expected = f"expected lines of {dims}-D points (lines, points, {dims})"
         raise UserError(f"{what}: points have shape {points.shape}, {expected}")
-    finite = np.isfinite(points).all((1, 2))
+    finite = np.isfinite(points)
     if not finite.all():
+        finite = finite.all((1, 2))
         raise UserError(f"{what}: line {int(finite.argmin())} has a coordinate that is not finite")
     return points
 

@@ -48,7 +48,8 @@ def _distances(a: Float[np.ndarray, "k n d"], b: Float[np.ndarray, "k m d"]) -> 
     pairs, n, m = len(a), a.shape[1], b.shape[1]
     cells = np.zeros((n, m, pairs))
     # Vertices come first, so that every step works on contiguous arrays over all pairs.
-    for first, second in zip(a.transpose(2, 1, 0), b.transpose(2, 1, 0), strict=True):
+    coordinates = (np.ascontiguousarray(lines.transpose(2, 1, 0)) for lines in (a, b))
+    for first, second in zip(*coordinates, strict=True):
         cells += (first[:, None] - second) ** 2
     cells = cells.reshape(n * m, pairs)
     if n == 1 or m == 1:
@@ -63,6 +64,6 @@ def _distances(a: Float[np.ndarray, "k n d"], b: Float[np.ndarray, "k m d"]) -> 
         # Index r + 1 holds row r. A cell is reached from the left (same row), from above and diagonally (previous row).
         best = np.minimum(last[low + 1 : high + 2], last[low : high + 1])
         np.minimum(best, before[low : high + 1], out=best)
-        before[low + 1 : high + 2] = np.maximum(best, here, out=best)
+        np.maximum(best, here, out=before[low + 1 : high + 2])
         before, last = last, before
     return np.sqrt(last[n])

@@ -18,7 +18,7 @@ from tflane_jax.training.checkpoint import Checkpoints
 from tflane_jax.training.vectors import ROW
 
 
-@pytest.fixture(scope="module", params=[pytest.param(count, marks=pytest.mark.slow) for count in (2, 8)])
+@pytest.fixture(scope="module", params=[2, pytest.param(8, marks=pytest.mark.slow)])
 def forced(request, tmp_path_factory):
     """Return the folder of a process with so many devices, and what it says."""
     folder = tmp_path_factory.mktemp("devices")

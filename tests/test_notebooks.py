@@ -61,7 +61,11 @@ def notebook(request):
     return request.param.stem, nbformat.read(request.param, as_version=4)
 
 
-@pytest.mark.slow
+@pytest.mark.parametrize(
+    "notebook",
+    [pytest.param(path, marks=[pytest.mark.slow] * (path.stem != "masking"), id=path.stem) for path in NOTEBOOKS],
+    indirect=True,
+)
 @pytest.mark.filterwarnings("default")
 def test_notebook_runs(notebook, tmp_path, monkeypatch):
     (name, notebook), client = notebook, pytest.importorskip("nbclient")

@@ -123,7 +123,7 @@ def test_runs_without_a_best_checkpoint_are_no_interim_look(tmp_path):
 def test_distances_are_metres_in_sentences():
     def effect(measure):
         claim, numbers = Claim("a", "b"), {"p": 0.01, "p_holm": 0.02, "better": 2, "seeds": (0, 1), "finding": "shown"}
-        spread = {"low": -0.2, "high": -0.1, "unbiased": (-0.2, -0.1), "seeds_low": -0.3, "seeds_high": 0.0}
+        spread = {"low": -0.2, "high": -0.1, "bias_corrected": (-0.2, -0.1), "seeds_low": -0.3, "seeds_high": 0.0}
         return Effect(measure, "last", claim, "b", mean=0.8, std=0.1, difference=-0.12, **spread, **numbers)
 
     names = ("all/AE_dist", "negative control clear/AE_dist", DIFFERENCE, "secondary measure all/mAP")

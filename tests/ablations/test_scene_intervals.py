@@ -57,7 +57,10 @@ def test_the_correction_for_bias_is_about_the_score_of_all_scenes():
     for seed, scores in found.rows("", "last")["+TFM"].items():
         scores["all/mAP"] = 0.04 + 1e-4 * seed  # samples are 0.01 too high on average
     (effect,) = effects(found, Declaration("all/mAP", (Claim("+TFM"),)), "", "last")
-    assert effect.unbiased == (pytest.approx(effect.low - 0.02, abs=3e-3), pytest.approx(effect.high - 0.02, abs=3e-3))
+    assert effect.bias_corrected == (
+        pytest.approx(effect.low - 0.02, abs=3e-3),
+        pytest.approx(effect.high - 0.02, abs=3e-3),
+    )
 
 
 def test_an_effect_that_some_samples_lack_is_not_shown():

@@ -21,7 +21,7 @@ EFFECT = Effect(
     difference=0.0767,
     low=0.05,
     high=0.09,
-    unbiased=(0.04, 0.08),
+    bias_corrected=(0.04, 0.08),
     mean=0.3,
     std=0.01,
     seeds_low=0.04,
@@ -54,7 +54,7 @@ def test_a_sentence_is_read_back():
 
 
 @pytest.mark.parametrize(
-    ("finding", "unbiased", "told"),
+    ("finding", "corrected", "told"),
     [
         ("shown", (-0.001, 0.08), True),
         ("contradicted", (-0.08, 0.0), True),
@@ -63,9 +63,9 @@ def test_a_sentence_is_read_back():
         ("shown", (float("nan"), float("nan")), False),
     ],
 )
-def test_a_verdict_that_a_correction_for_bias_would_change_says_so(finding, unbiased, told):
-    text = sentence([replace(EFFECT, finding=finding, unbiased=unbiased)])
-    low, high = (100 * end for end in unbiased)
+def test_a_verdict_that_a_correction_for_bias_would_change_says_so(finding, corrected, told):
+    text = sentence([replace(EFFECT, finding=finding, bias_corrected=corrected)])
+    low, high = (100 * end for end in corrected)
     assert (f", but corrected for bias the interval is {low:+.2f} to {high:+.2f})" in text) == told
     assert ("bias" in text) == told
     assert only_row(text) == only_row(sentence([EFFECT])) | {"verdict": finding}

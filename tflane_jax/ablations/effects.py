@@ -68,7 +68,7 @@ class Effect:
         mean, std: of the other row, over seeds; the standard deviation with n - 1, NaN for one seed.
         difference: treatment minus the other row, mean over seeds.
         low, high: 95 % interval of the difference over scenes, the seeds averaged; NaN where there is none.
-        unbiased: the same, corrected for bias, see `statistics.bias_corrected`; it decides nothing.
+        bias_corrected: the same, corrected for bias, see `statistics.bias_corrected`; it decides nothing.
         seeds_low, seeds_high: 95 % t interval over seeds, on these scenes; NaN where `PairedDifference.interval` is.
         p, p_holm: of the two-sided paired t-test over seeds, and corrected for all of this measure and checkpoint.
         better: number of seeds in which the treatment is better.
@@ -85,7 +85,7 @@ class Effect:
     difference: float
     low: float
     high: float
-    unbiased: tuple[float, float]
+    bias_corrected: tuple[float, float]
     seeds_low: float
     seeds_high: float
     p: float
@@ -238,7 +238,7 @@ def _effect(
     table, both = results.rows(test, which), (claim.treatment, row)
     treated, other = (values(table[name], measure, seeds) for name in both)
     samples = _samples(results, test, which, measure, both, seeds)
-    drawn = samples[claim.treatment] - samples[row] if samples else np.full(0, math.nan)
+    drawn = samples[claim.treatment] - samples[row] if samples else np.zeros(0)
     low, high = interval(drawn)
     paired = paired_difference(sign * treated, sign * other)
     seeds_low, seeds_high = sorted(sign * end for end in paired.interval())
@@ -252,7 +252,7 @@ def _effect(
         difference=sign * paired.mean,
         low=low,
         high=high,
-        unbiased=bias_corrected(drawn, sign * paired.mean),
+        bias_corrected=bias_corrected(drawn, sign * paired.mean),
         seeds_low=seeds_low,
         seeds_high=seeds_high,
         p=paired.p_value,

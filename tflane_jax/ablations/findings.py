@@ -110,7 +110,7 @@ def _numbers(effect: Effect, score: str) -> str:
         return " ".join([f"{factor * effect.difference:+.2f} {unit}", *(f"({part})" for part in parts)])
     parts += [_p_value(effect.p_holm), f"better in {effect.better} of {len(effect.seeds)} seeds"]
     parts += [NO_INTERVAL] if math.isnan(effect.low) else []
-    low, high = (factor * end for end in effect.unbiased)
+    low, high = (factor * end for end in effect.bias_corrected)
     if effect.finding != "not shown" and low <= 0 <= high:
         parts.append(f"but corrected for bias the interval is {low:+.2f} to {high:+.2f}")
     return f"{factor * effect.difference:+.2f} {unit} ({', '.join(parts)})"

@@ -168,7 +168,8 @@ def _differences(
         if their_task == our_task:
             fraction = f"{common:,} of {total:,} parameters ({100 * common / total:.0f} %)"
             instead += f"; training.init_partly takes over the {fraction} that both have"
-            instead += ", and the others start at random" * bool(added)
+            if added:
+                instead += ", and the others start at random"
         raise UserError(f"{other} ({(added or dropped)[0]} {where}){instead}")
     for module in frozen:
         if any(name.startswith(f"{module}/") for name in added):

@@ -186,7 +186,7 @@ def test_a_score_that_no_number_can_hold_is_named(run):
 )
 def test_wrong_progress_names_the_checkpoint(change, tmp_path):
     checkpoints = Checkpoints(tmp_path)
-    assert carried(checkpoints, Latest(step=3, progress=PROGRESS), []).seconds == 1.0
+    assert carried(checkpoints, Latest(step=3, progress=PROGRESS), []).times.seconds == 1.0
     with pytest.raises(UserError, match=r"step_00000003 is damaged .*progress is not what was written"):
         carried(checkpoints, Latest(step=3, progress=PROGRESS | change), [])
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -34,7 +34,7 @@ from tflane_jax.training.manifest import Manifest
 from tflane_jax.training.notices import due_notices, missing_scores, not_finite, only_told, print_notices
 from tflane_jax.training.records import Record, RecordWriter, Unwritten, Window, by_name, read_records, seed_record
 from tflane_jax.training.restarts import adapt
-from tflane_jax.training.resumption import carried, latest
+from tflane_jax.training.resumption import Carried, carried, latest
 from tflane_jax.training.run_folder import (
     CurrentForm,
     Start,
@@ -48,7 +48,6 @@ from tflane_jax.training.schedule import OptimConfig, make_optimizer, scaled_to_
 from tflane_jax.training.sharding import placed
 from tflane_jax.training.state import init_states, of_all_seeds, per_seed, state_of
 from tflane_jax.training.step import UpdateForm, compiled_update, update_all
-from tflane_jax.training.step_time import StepTime
 from tflane_jax.training.task import Trainable
 
 Evaluate = Callable[[Params], dict[str, float]]
@@ -196,18 +195,15 @@ def train(
             # Augmentation may change the size of images, and the model takes what it returns.
             example = example if prepare is None else prepare(example, (config.seeds[0], 0, 0))
             states = init_states(task, optimizer, config.seeds, example)
-        window, metrics, times = Window(), {}, StepTime()
-        memories = [Memory() for _ in config.seeds]
+        carry = Carried([] if adaptive is None else [Memory() for _ in config.seeds])
         started_from: dict[str, Any] = {"own_modules": own_code}
-        data, due = {"examples": example_count(arrays), "content": content}, False
+        data = {"examples": example_count(arrays), "content": content}
         agree_on_data(data)
         if start == "resume" and (saved := from_first(lambda: latest(checkpoints))) is not None:
             whole = of_all_seeds(states)
             with stage(f"restoring step {saved['step']}"):
                 restored = arrays_from_first(lambda: checkpoints.restore(saved["step"], whole), whole)
-            states, before = per_seed(restored, config.seeds), carried(checkpoints, saved, memories)
-            window, metrics, times.seconds = before.window, before.metrics, before.seconds
-            memories, due = before.memories, before.due
+            states, carry = per_seed(restored, config.seeds), carried(checkpoints, saved, carry.memories)
             check_same_data(folder, data | saved["progress"], data)
         elif (origin := config.init_from) is not None:
             fresh = states
@@ -249,11 +245,8 @@ def train(
         # =============================================================================================================
         # Steps
         # =============================================================================================================
-        def save(evaluated: dict[str, float], **more: bool) -> None:
-            carried = {"window": asdict(window), "seconds": times.seconds, "metrics": metrics} | data
-            if adaptive is not None:
-                carried["cycles"] = [asdict(memory) for memory in memories]
-            manifest = Manifest(step=step, config=resolved, metrics=evaluated, progress=carried | more)
+        def save(evaluated: dict[str, float]) -> None:
+            manifest = Manifest(step=step, config=resolved, metrics=evaluated, progress=carry.to_json() | data)
             kept = of_all_seeds([of_one_process(state) for state in states])
             from_first(lambda: str(checkpoints.save(kept, manifest)))
 
@@ -270,6 +263,7 @@ def train(
 
         unread: Exception | None = None
         saved_step, stopped = first, stop_signal(stop.signal, 0)
+        due, carry.due = carry.due, False
         untold = dict(getattr(task, "notices", {}))
         with (
             RecordWriter(folder, first, due) if is_first() else Unwritten() as writer,
@@ -278,25 +272,27 @@ def train(
 
             def evaluate_and_save(evaluate: Evaluate) -> None:
                 """Evaluate, let the schedule adapt, write the checkpoint, and draw."""
-                nonlocal states, metrics, memories
+                nonlocal states
                 try:
                     measured = [evaluate(state.ema_params) for state in states]  # several processes predict together
                 except Exception:
                     if processes.process_count() == 1:  # several would wait for one another
-                        save({}, due=True)  # a resumed run begins with this evaluation
+                        carry.due = True  # a resumed run begins with this evaluation
+                        save({})
                     raise
                 evaluations = from_first(lambda: measured)
                 writer.write(seed_record(step, "val", scores := by_name(evaluations)))
-                if not metrics and is_first():
+                if not carry.metrics and is_first():
                     print_notices(missing_scores(step, scores, config.best_metric, adaptive))
-                metrics = {name: float(np.mean(values)) for name, values in scores.items()}
+                carry.metrics = {name: float(np.mean(values)) for name, values in scores.items()}
                 if adaptive is not None:
                     together = of_all_seeds([state.opt_state for state in states])
-                    together, memories, cycles = adapt(adaptive, together, memories, evaluations, config.steps)
+                    adapted = adapt(adaptive, together, carry.memories, evaluations, config.steps)
+                    together, carry.memories, cycles = adapted
                     changed = per_seed(together, config.seeds)
                     states = [replace(s, opt_state=place(o)) for s, o in zip(states, changed, strict=True)]
                     writer.write(seed_record(step, "cycle", cycles))
-                save(metrics)
+                save(carry.metrics)
                 if drawn:
                     shown = states[0].ema_params  # several processes gather them together
                     if draw is not None and is_first():
@@ -313,22 +309,22 @@ def train(
                     searched = batch if processes.process_count() == 1 else ()
                     raise AgreedError(not_finite(values, step, config.seeds, checkpoints.path(step), searched))
                 step += 1
-                window.add({name: value for name, value in values.items() if name != "finite"})
+                carry.window.add({name: value for name, value in values.items() if name != "finite"})
                 asked = time.perf_counter()
                 batch = following()
                 ended = time.perf_counter()
-                times.add(ended - began, waited=ended - asked)
+                carry.times.add(ended - began, waited=ended - asked)
                 bar.update()
 
                 is_last = step == config.steps
                 if step % config.log_every == 0 or is_last:
-                    record = window.record(step)
-                    writer.write(record | times.record())
-                    print_notices(times.notices(step, arrays))  # every process waits for examples of its own
+                    record = carry.window.record(step)
+                    writer.write(record | carry.times.record())
+                    print_notices(carry.times.notices(step, arrays))  # every process waits for examples of its own
                     if is_first():
                         print_notices(due_notices(untold, record))
-                    bar.set_postfix_str(f"loss={np.mean(record['loss']):.4g}{times.shown()}", refresh=False)
-                    window = Window()
+                    bar.set_postfix_str(f"loss={np.mean(record['loss']):.4g}{carry.times.shown()}", refresh=False)
+                    carry.window = Window()
                 if evaluate is not None and (step % config.eval_every == 0 or is_last):
                     evaluate_and_save(evaluate)
                     saved_step = step
@@ -345,6 +341,6 @@ def train(
             if unread is not None:
                 print_notices([f"step {step} is saved: go on with --resume when the next examples can be read"])
                 raise unread
-        rate = (step - first) / times.own if times.own else 0.0
+        rate = (step - first) / carry.times.own if carry.times.own else 0.0
         unfinished = stopped if step < config.steps else None
-        return TrainingResult(step, metrics, compile_seconds, rate, asked_by=stopped, stopped_by=unfinished)
+        return TrainingResult(step, carry.metrics, compile_seconds, rate, asked_by=stopped, stopped_by=unfinished)

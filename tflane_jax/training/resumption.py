@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any, TypedDict
 
 from tflane_jax.errors import UserError
 from tflane_jax.training.adaptive import Memory
 from tflane_jax.training.checkpoint import Checkpoints
 from tflane_jax.training.records import Window
+from tflane_jax.training.step_time import StepTime
 
 # What the entry raises where it is not what was written.
 _WRONG = (KeyError, TypeError, ValueError, AttributeError, OverflowError)
@@ -22,23 +23,30 @@ class Latest(TypedDict):
     progress: dict[str, Any]
 
 
-@dataclass(frozen=True)
+@dataclass
 class Carried:
-    """Progress as the loop takes it up.
+    """What the loop carries from step to step beside its state, and checkpoints hold.
 
     Attributes:
+        memories: of the adaptive schedule, one a seed; none without it.
         window: sums since the last record.
         metrics: of the last evaluation.
-        seconds: of all steps so far.
-        memories: of the adaptive schedule, one a seed.
+        times: of the steps so far.
         due: whether the evaluation of this step is still to be made.
     """
 
-    window: Window
-    metrics: dict[str, float]
-    seconds: float
     memories: list[Memory]
-    due: bool
+    window: Window = field(default_factory=Window)
+    metrics: dict[str, float] = field(default_factory=dict)
+    times: StepTime = field(default_factory=StepTime)
+    due: bool = False
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the entry "progress" of a checkpoint; `carried` reads it."""
+        entry = {"window": asdict(self.window), "seconds": self.times.seconds, "metrics": self.metrics}
+        if self.memories:
+            entry["cycles"] = [asdict(memory) for memory in self.memories]
+        return entry | {"due": True} if self.due else entry
 
 
 def latest(checkpoints: Checkpoints) -> Latest | None:
@@ -73,10 +81,10 @@ def carried(checkpoints: Checkpoints, saved: Latest, fresh: Sequence[Memory]) ->
     try:
         sums = {name: list(map(float, values)) for name, values in progress["window"]["sums"].items()}
         return Carried(
+            memories=[Memory(**one) for one in progress.get("cycles", [])] or list(fresh),
             window=Window(int(progress["window"]["steps"]), sums),
             metrics={name: float(value) for name, value in progress["metrics"].items()},
-            seconds=float(progress["seconds"]),
-            memories=[Memory(**one) for one in progress.get("cycles", [])] or list(fresh),
+            times=StepTime(seconds=float(progress["seconds"])),
             due=bool(progress.get("due")),
         )
     except _WRONG as error:

@@ -1,10 +1,11 @@
 """Bipartite (Hungarian) matching of queries to targets.
 
-Two backends give the same assignments, as long as costs have no ties and none is near the limit of 1e6, at which
-differences of other pairs are lost to float32. "jax" runs on the device, in a program that JAX can keep between
-processes (persistent compilation cache), and takes as long as scipy at the sizes of small models. "scipy" runs on the
-host: one call per step for every layer and example, because the callback receives `vmap`ped axes as batch axes and
-loops over them. A program with a host callback can be neither exported nor kept, so do not use it in prediction.
+Two backends give the same assignments, as long as costs have no ties and none is so large that float32 loses the
+differences of other pairs: near the limit of 1e6, or large and negative where a query is chosen by it. "jax" runs on
+the device, in a program that JAX can keep between processes (persistent compilation cache), and takes as long as scipy
+at the sizes of small models. "scipy" runs on the host: one call per step for every layer and example, because the
+callback receives `vmap`ped axes as batch axes and loops over them. A program with a host callback can be neither
+exported nor kept, so do not use it in prediction.
 
 Where a batch is divided among devices, each device (or its host) solves the problems of its own examples. "scipy" is
 refused where these devices are parts of one CPU: its callbacks occupy the threads that copy their arguments, and can

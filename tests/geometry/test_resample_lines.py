@@ -18,6 +18,12 @@ def test_equals_one_at_a_time(seed, lines, count):
     np.testing.assert_allclose(resample_lines(ragged, count), expected, atol=1e-9)
 
 
+def test_many_float32_lines_are_as_exact_as_one():
+    lines = np.random.default_rng(0).uniform(0, 100, (3000, 2, 2)).astype(np.float32)
+    expected = np.stack([resample(line.astype(np.float64), 5) for line in lines[-10:]])
+    np.testing.assert_allclose(resample_lines(list(lines), 5)[-10:], expected, atol=1e-5)
+
+
 def test_no_lines_and_an_empty_line():
     assert resample_lines([], 5).shape == (0, 5, 3)
     with pytest.raises(ValueError, match="without points"):

@@ -12,6 +12,7 @@ from benchmarks.gpu.steps import everywhere
 from tests.models.cases import WITH_TRAFFIC, make_example
 from tflane_jax.config import load_config
 from tflane_jax.layers.attention import MultiHeadAttention
+from tflane_jax.layers.graph import RelationshipHead
 from tflane_jax.layers.precision import Precision, computing, run_layer
 from tflane_jax.scene import shapes_of
 from tflane_jax.summary import shapes_of_params
@@ -103,6 +104,18 @@ def test_a_layer_keeps_a_dtype_of_its_own():
     with computing("bfloat16"):
         found = jax.eval_shape(lambda x: dense.init_with_output(jax.random.key(0), x)[0], X)
     assert found.dtype == jnp.float32
+
+
+def test_edge_logits_are_not_rounded():
+    """Of bfloat16 numbers there are 128 between 1 and 2: many pairs would have the same score."""
+    lanes = np.random.default_rng(0).normal(size=(60, 16)).astype(np.float32)
+    head = RelationshipHead(8)
+    params = head.init(jax.random.key(0), lanes, lanes)
+    with computing("bfloat16"):
+        logits = np.asarray(head.apply(params, lanes, lanes))
+    assert logits.dtype == np.float32
+    assert (logits != logits.astype(jnp.bfloat16)).mean() > 0.9
+    np.testing.assert_allclose(logits, head.apply(params, lanes, lanes), atol=0.05)
 
 
 @pytest.mark.slow

@@ -86,6 +86,17 @@ def test_a_crossroads_has_four_arms_and_three_turns_each(junction):
     assert junction.minor[arms[inward(0)]] == junction.minor[arms[inward(2)]]
 
 
+@pytest.mark.parametrize("origin", [(4e5, 5.4e6), (-1e6, 0.0)])
+def test_a_junction_is_the_same_in_global_coordinates(junction, origin):
+    moved = {
+        name: replace(one, centerline=one.centerline + np.array([*origin, 0.0]))
+        for name, one in crossroads(split=0.5).map.segments.items()
+    }
+    (found,) = find_junctions(traffic_lanes(moved), moved)
+    np.testing.assert_array_equal(found.meet, junction.meet)
+    assert (found.turn, found.minor, found.phase) == (junction.turn, junction.minor, junction.phase)
+
+
 @pytest.mark.parametrize("signals", [False, True])
 def test_left_turns_give_way_to_oncoming_traffic_and_nobody_waits_in_a_circle(junction, signals):
     gives_way = junction.gives_way(signals)

@@ -70,7 +70,7 @@ def resample_lines(lines: Sequence[Float[np.ndarray, "_ d"]], count: int) -> Flo
     sizes = np.array([len(line) for line in lines])
     if sizes.min() == 0:
         raise ValueError("cannot resample a polyline without points")
-    points = np.concatenate(lines)
+    points = np.concatenate(lines).astype(np.float64)  # the distance runs through all lines
     first = np.cumsum(sizes) - sizes
     last = first + sizes - 1
     steps = np.linalg.norm(np.diff(points[:, :2], axis=0), axis=-1)

@@ -128,6 +128,7 @@ class RelationshipHead(nn.Module):
     @nn.compact
     def __call__(self, a: Float[Array, "a c"], b: Float[Array, "b c"]) -> Float[Array, "a b"]:
         """Return a logit for each pair."""
+        dtype = a.dtype
         a = Mlp((a.shape[-1], a.shape[-1], self.hidden), name="mlp_first")(a)
         b = Mlp((b.shape[-1], b.shape[-1], self.hidden), name="mlp_second")(b)
         width = 2 * self.hidden
@@ -135,7 +136,8 @@ class RelationshipHead(nn.Module):
         second = nn.Dense(width, use_bias=False, name="pair_second")(b)
         pair = nn.relu(first[:, None] + second[None, :])
         pair = nn.relu(nn.Dense(width, name="pair_hidden")(pair))
-        return nn.Dense(1, name="pair_out")(pair)[..., 0]
+        # also where the layers compute in bfloat16, whose 8 bits would give many pairs the same score
+        return nn.Dense(1, dtype=dtype, name="pair_out")(pair)[..., 0]
 
 
 class Mlp(nn.Module):

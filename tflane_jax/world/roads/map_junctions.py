@@ -183,7 +183,7 @@ def _junction(
         arm=tuple(arms),
         entry=tuple(not before[i] for i in members),
         turn=tuple(turn[i] for i in members),
-        meet=lines_meet(lines, arms, [lanes[i].vehicle for i in members]),
+        meet=lines_meet([line - lines[0][0] for line in lines], arms, [lanes[i].vehicle for i in members]),
         minor=_minor(
             heading, [sum(a == k and turn[i] == THROUGH for i, a in arm.items()) for k, _ in enumerate(heading)]
         ),

@@ -29,7 +29,7 @@ def lines_meet(
     Connectors of one arm diverge and do not conflict, except a bicycle's with a vehicle's.
 
     Args:
-        lines: their centerlines, metres; vertices evenly spaced.
+        lines: their centerlines, metres, near the origin (distances are taken in float32); vertices evenly spaced.
         arms: from which each comes.
         vehicles: whether motor vehicles may use each.
     """

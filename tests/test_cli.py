@@ -87,6 +87,7 @@ def test_evaluation_prints_and_writes_the_table(trained, capsys):
     assert main(["eval", str(trained), "--split", "val", "--checkpoint", "last"]) == 0
     said = capsys.readouterr().out
     assert "OpenLane-V2 centerline v2.1" in said
+    assert "was chosen as the best" not in said
     written = json.loads((trained / "evaluations" / "procedural-val-step4.json").read_text())
     assert (written["meta"]["step"], written["meta"]["max_instances"]) == (4, None)
     assert "v2.1" in written["meta"]["protocol"]
@@ -156,7 +157,7 @@ def test_prediction_writes_arrays_json_and_pictures(trained, tmp_path):
 
 
 @pytest.mark.parametrize("version", ["v1.0", "v2.1"])
-def test_a_whole_split_is_predicted_in_parts_and_scored(trained, tmp_path, monkeypatch, version):
+def test_a_whole_split_is_predicted_in_parts_and_scored(trained, tmp_path, monkeypatch, capsys, version):
     drawn = []
     monkeypatch.setattr("tflane_jax.commands.predict_lanes.MOST_DRAWN", 2)
     monkeypatch.setattr("tflane_jax.evaluation.predict._AT_ONCE", 2)
@@ -171,6 +172,7 @@ def test_a_whole_split_is_predicted_in_parts_and_scored(trained, tmp_path, monke
     assert main(["score", f"openlane-{version}-centerline", *files, "--out", str(tmp_path / "score")]) == 0
     scored = json.loads((tmp_path / "score.json").read_text())["rows"][0]
     assert main(["eval", str(trained), "--split", "val", "--out", str(tmp_path / "eval")]) == 0
+    assert "was chosen as the best one by these examples" in capsys.readouterr().out
     evaluated = json.loads((tmp_path / "eval.json").read_text())["rows"][0]
     assert scored["frames"] == 5
     assert scored["DET_l"] == pytest.approx(evaluated["DET_l"])

@@ -18,7 +18,7 @@ from tflane_jax.config import (
     load_config,
     with_reference_batch,
 )
-from tflane_jax.config_io import from_json, to_json, to_text
+from tflane_jax.config_io import from_json, to_json, to_text, with_setting
 from tflane_jax.config_overrides import apply_overrides
 from tflane_jax.errors import UserError
 from tflane_jax.models.priors import PriorsConfig
@@ -127,6 +127,18 @@ def test_a_configuration_of_paper_size_has_half_precision_and_recomputed_activat
     found = {key: to_text(configurations()[f"{name}.{key}"]) for key in ("remat", "bfloat16")}
     assert "encoder.images.remat = True" in found["remat"]
     assert "encoder.images.precision = 'bfloat16'" in found["bfloat16"]
+
+
+@pytest.mark.parametrize(
+    ("name", "same"),
+    [("tf_lane/toponet", False), ("gtn_lane/gtn", False), ("camera/toponet_r50", True), ("tf_lane/argoverse2", True)],
+)
+def test_a_configuration_says_whether_its_best_checkpoint_is_chosen_by_test_examples(name, same):
+    config = load_config(name)
+    assert config.chosen_by(config.data.source("test")) == same
+    assert config.chosen_by(config.data.source("val"))
+    assert not config.chosen_by(config.data.source("train"))
+    assert not with_setting(config, "training.eval_every", config.training.steps).chosen_by(config.data.source("val"))
 
 
 def test_a_scaled_learning_rate_starts_from_the_batch_of_the_file():

@@ -99,6 +99,10 @@ class RunConfig:
         """The warm-up ends before the run does."""
         yield warmup_fits(self.optim, self.training.steps)
 
+    def chosen_by(self, source: Any) -> bool:
+        """Return whether the best of a run's checkpoints is chosen by the examples of this source."""
+        return self.training.steps > self.training.eval_every and self.data.source("val") == source
+
 
 def load_config(reference: str) -> RunConfig:
     """Return a configuration: `path.py`, a shipped one (`tf_lane/toponet_tfm`), or an ablation of either (`...:name`).

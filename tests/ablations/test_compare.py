@@ -13,7 +13,7 @@ from tflane_jax.ablations import workers
 from tflane_jax.ablations.compare import compare
 from tflane_jax.ablations.jobs import Job
 from tflane_jax.ablations.workers import Worker, worker_threads
-from tflane_jax.config import EvaluationConfig, RunConfig, WorldData
+from tflane_jax.config import EvaluationConfig, RunConfig, WorldData, load_config
 from tflane_jax.errors import UserError
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.training.loop import TrainingConfig
@@ -137,3 +137,14 @@ def test_two_workers_train_all_runs_and_name_the_one_that_failed(tmp_path, monke
     with pytest.raises(UserError, match=r"one: optim\.warmup_steps is 1000"):
         compare(broken, (0, 1), tmp_path / "broken", jobs=2)
     assert not (tmp_path / "broken").exists()
+
+
+@pytest.mark.parametrize(("name", "named"), [("camera/toponet_r50", True), ("camera/toponet", False)])
+def test_rows_whose_best_checkpoint_is_chosen_by_test_examples_are_named(name, named, tmp_path, monkeypatch, capsys):
+    def planned(*_, **__):
+        raise UserError("planned")
+
+    monkeypatch.setattr("tflane_jax.ablations.compare.plan_jobs", planned)
+    with pytest.raises(UserError, match="planned"):
+        compare({"host": load_config(name)}, [0], tmp_path)
+    assert ("host: validation and test examples are the same" in capsys.readouterr().err) == named

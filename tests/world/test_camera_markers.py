@@ -18,6 +18,7 @@ from tflane_jax.world.cameras.pictures import paint_picture
 from tflane_jax.world.cameras.ring import CameraRigConfig, draw_rig
 from tflane_jax.world.cameras.sensor import render_cameras, render_window
 from tflane_jax.world.cameras.solids import draw_bodies, join, pack
+from tflane_jax.world.render.exposure import Window, develop
 from tflane_jax.world.render.polygons import Solid
 from tflane_jax.world.render.shapes import box
 from tflane_jax.world.render.weather import FrontWeatherConfig, draw_weather
@@ -188,6 +189,19 @@ def test_a_window_is_a_part_of_the_image():
     assert np.ptp(part) > 60
     with pytest.raises(UserError, match="window"):
         render_window(log, 0, FRONT, (600, 0), (140, 90))
+
+
+def test_a_part_gets_its_part_of_the_rain():
+    rain = replace(WEATHER, rain=0.9, noise=0.0, blur=0.0)
+
+    def image(height, width, window=None):
+        return develop(np.random.default_rng(3), np.full((height, width, 3), 90, np.uint8), rain, 1.5, window)
+
+    whole, part = image(360, 640), image(90, 140, Window((640, 360), (200, 120)))
+    # Lens and image border: streaks from above the part reach into it.
+    np.testing.assert_array_equal(part[3:-3, 3:-3], whole[120:210, 200:340][3:-3, 3:-3])
+    assert 0.005 < (part.max(-1) > np.median(part) + 3).mean() < 0.2
+    np.testing.assert_array_equal(image(360, 640, Window((640, 360), (0, 0))), whole)
 
 
 def test_a_marker_of_the_log_is_drawn_and_found_and_none_change_nothing():

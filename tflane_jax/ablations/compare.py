@@ -77,6 +77,7 @@ def compare(
     tests = dict(tests or {})
     _check_names(configs)
     _check_tests(configs, tests)
+    print_notices(_chosen_on_test(configs))
     if declaration is not None:
         check(declaration, configs)
     plan = plan_jobs(configs, seeds, out, threads=worker_threads(jobs), tests=tests, retrain=retrain)
@@ -118,6 +119,13 @@ def _check_names(configs: Mapping[str, RunConfig]) -> None:
     for model, way in itertools.product(configs, INTERVENTIONS):
         if (name := f"{model}, {way}") in configs:
             raise UserError(f"{name!r} is the name of an intervention on {model}: give the configuration another one")
+
+
+def _chosen_on_test(configs: Mapping[str, RunConfig]) -> list[str]:
+    """Return the notice for rows whose best checkpoint is chosen by the examples that they are tested on."""
+    names = [name for name, config in configs.items() if config.chosen_by(config.data.source("test"))]
+    said = "validation and test examples are the same, so that rows of the best checkpoint are too good by chance"
+    return [f"{', '.join(names)}: {said}; those of the last one are not chosen"] if names else []
 
 
 def _check_tests(configs: Mapping[str, RunConfig], tests: Tests) -> None:

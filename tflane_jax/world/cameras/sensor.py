@@ -27,7 +27,7 @@ from tflane_jax.world.cameras.ring import CameraRigConfig, camera_stream, draw_r
 from tflane_jax.world.cameras.solids import draw_bodies
 from tflane_jax.world.cameras.stage import SHADE_TEXEL, Stage, Stream, stage_of
 from tflane_jax.world.render.camera import PinholeCamera
-from tflane_jax.world.render.exposure import develop
+from tflane_jax.world.render.exposure import Window, develop
 from tflane_jax.world.render.weather import Weather
 
 # Image width to which the strengths of rain streaks and lens blur refer, pixels.
@@ -69,7 +69,7 @@ def render_cameras(log: Log, keyframe: int, config: CameraRigConfig) -> CameraVi
         picture = _draw(stage, moment, view, config)
         rng = camera_stream(log.seed, mount, Stream.PICTURE, keyframe)
         image[number, : camera.height, : camera.width] = _develop(
-            rng, picture, camera, stage.weather, max(camera.width, camera.height)
+            rng, picture, camera, stage.weather, Window((camera.width, camera.height), (0, 0))
         )
     depth, depth_valid = None, None
     if config.depth_cell is not None:
@@ -128,7 +128,7 @@ def render_window(
         number, moment = keyframe, moment_of(log, keyframe, stage, config)
     picture = _draw(stage, moment, _view(part, config.supersample, moment), config)
     rng = camera_stream(log.seed, config.cameras[camera], Stream.PICTURE, number, left, top)
-    return _develop(rng, picture, part, stage.weather, max(whole.width, whole.height))
+    return _develop(rng, picture, part, stage.weather, Window((whole.width, whole.height), corner))
 
 
 def visible_elements(log: Log, keyframe: int, config: CameraRigConfig) -> ElementViews:
@@ -222,12 +222,16 @@ def _ground_colour(moment: Moment, view: View, x: np.ndarray, y: np.ndarray) -> 
 
 
 def _develop(
-    rng: np.random.Generator, picture: UInt8[np.ndarray, "H W 3"], camera: PinholeCamera, weather: Weather, longest: int
+    rng: np.random.Generator,
+    picture: UInt8[np.ndarray, "H W 3"],
+    camera: PinholeCamera,
+    weather: Weather,
+    window: Window,
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Return the delivered image at its own size; `longest` is the longer side of the camera's whole image."""
+    """Return the delivered image at the size of `camera`, which may be a part (`window`) of a larger one."""
     import cv2
 
     if picture.shape[0] != camera.height:
         picture = cv2.resize(picture, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
-    scale = longest / _PICTURE
-    return develop(rng, picture, replace(weather, blur=weather.blur * min(scale, 2.0)), scale)
+    scale = max(window.whole) / _PICTURE
+    return develop(rng, picture, replace(weather, blur=weather.blur * min(scale, 2.0)), scale, window)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -17,8 +18,25 @@ def _grain() -> Float[np.ndarray, " n"]:
     return np.random.default_rng(20_250_714).standard_normal(1 << 21, np.float32)
 
 
+@dataclass(frozen=True)
+class Window:
+    """Where a part of a camera's image lies, pixels.
+
+    Attributes:
+        whole: width and height of the whole image.
+        corner: column and row of the part's upper left pixel.
+    """
+
+    whole: tuple[int, int]
+    corner: tuple[int, int]
+
+
 def develop(
-    rng: np.random.Generator, image: UInt8[np.ndarray, "h w 3"], weather: Weather, scale: float = 1.0
+    rng: np.random.Generator,
+    image: UInt8[np.ndarray, "h w 3"],
+    weather: Weather,
+    scale: float = 1.0,
+    window: Window | None = None,
 ) -> UInt8[np.ndarray, "h w 3"]:
     """Return the delivered image after rain streaks, blur, exposure, contrast, tint and noise.
 
@@ -27,11 +45,12 @@ def develop(
         image: light at the lens; rain streaks are added to it in place.
         weather: with the camera's tone.
         scale: length of the rain streaks; 1 for images of 640 x 360.
+        window: which part of a larger image this one is; None for a whole one.
     """
     import cv2
 
     if weather.rain:
-        _streaks(rng, image, weather, scale)
+        _streaks(rng, image, weather, scale, window or Window(image.shape[1::-1], (0, 0)))
     # A lens spreads a point over about a pixel at best.
     image = cv2.GaussianBlur(image, (0, 0), 0.45 + weather.blur)
     levels = np.arange(256, dtype=np.float32)[:, None] / 255.0 * (weather.exposure * weather.tint).astype(np.float32)
@@ -45,12 +64,12 @@ def develop(
     return image
 
 
-def _streaks(rng: np.random.Generator, image: np.ndarray, weather: Weather, scale: float) -> None:
+def _streaks(rng: np.random.Generator, image: np.ndarray, weather: Weather, scale: float, window: Window) -> None:
     import cv2
 
-    h, w = image.shape[:2]
+    # All streaks of the whole image are drawn: a small part has few of them.
     count = int(260 * weather.rain)
-    start = rng.uniform(0.0, 1.0, (count, 2)) * [w, h]
+    start = rng.uniform(0.0, 1.0, (count, 2)) * window.whole - window.corner
     fall = scale * rng.uniform(6.0, 22.0, (count, 1)) * [rng.uniform(-0.3, 0.3), 1.0]
     layer = image.copy()
     lines = np.round(np.stack([start, start + fall], 1) * 16).astype(np.int32)

@@ -11,7 +11,9 @@ import re
 import pytest
 
 from tests.shared import ROOT
-from tflane_jax.ablations.verdicts import verdicts
+from tflane_jax.ablations.effect_records import claim_row
+from tflane_jax.ablations.effects import DIFFERENCE as OF_THE_TWO
+from tflane_jax.ablations.findings import points
 
 PAGES = (
     "README.md",
@@ -69,7 +71,6 @@ NUMBER = r"[+-]?\d+\.\d+"
 # "7.6 points over the control (+5.9 to +9.3, p = 0.02" and "(+6.1 points over the control, p = 0.003)".
 INTERVAL = re.compile(rf"({NUMBER})([^()\d]*)\(({NUMBER}) to ({NUMBER})(?:[^()]*?, p [=<] (\d\.\d+))?")
 DIFFERENCE = re.compile(rf"\(({NUMBER})\s+points[^()\d]*, p = (\d\.\d+)\)")
-FINDING = re.compile(rf"({NUMBER}) points \((?:95 % ({NUMBER}) to ({NUMBER})[,)] ?)?(?:p [<]? ?(\d\.\d+), )?")
 
 
 def summaries():
@@ -79,7 +80,7 @@ def summaries():
         *(path for folder in folders for path in folder.glob("*.json")),
         ROOT / "docs" / "carry_over" / "carry_over.json",
     ]
-    return {path.stem: {"findings": [], **json.loads(path.read_text(encoding="utf-8"))} for path in paths}
+    return {path.stem: {"effects": [], **json.loads(path.read_text(encoding="utf-8"))} for path in paths}
 
 
 def tables(text):
@@ -128,10 +129,11 @@ def wrong_tables(text, recorded):
 def wrong_sentences(text, recorded):
     """Return what is wrong with the differences and intervals that a page tells, and how many numbers were compared."""
     effects = [
-        [None if number is None else float(number) for number in match.groups()]
+        _as_told(numbers, effect["measure"])
         for summary in recorded.values()
-        for finding in summary["findings"]
-        for match in FINDING.finditer(finding)
+        for effect in summary["effects"]
+        for numbers in (effect, *effect["further"])
+        if numbers["difference"] is not None
     ]
     told = [(m[0], m[1] if m[1][0] in "+-" else None, m[1], m[3], m[4], m[5]) for m in INTERVAL.finditer(text)]
     told += [(m[0], m[1], m[1], None, None, m[2]) for m in DIFFERENCE.finditer(text)]
@@ -149,6 +151,17 @@ def wrong_sentences(text, recorded):
         if not same:
             wrong.append(f"no recorded finding has these numbers: {' '.join(words.split())}")
     return wrong, count
+
+
+def _as_told(numbers, primary):
+    """Return difference, ends of the interval and p as the page of results tells them, from which others quote."""
+    factor, unit = points(primary if numbers["measure"] == OF_THE_TWO else numbers["measure"])
+    assert unit == "points"
+    ends = [
+        None if numbers[name] is None else round(factor * numbers[name], 2) for name in ("difference", "low", "high")
+    ]
+    p = numbers.get("p below", numbers["p"])
+    return [*ends, None if p is None else max(round(p, 4), 1e-4)]
 
 
 def _rounds(value, text):
@@ -218,9 +231,10 @@ def wrong_verdicts(text, recorded):
                 for column, pattern, cell in zip(columns, quoted, cells, strict=True):
                     names = fnmatch.filter(recorded, pattern)
                     found = {
-                        f"{verdict['verdict']} {verdict['difference'].removesuffix(' points')}"
-                        for verdict in verdicts({name: recorded[name] for name in names})
-                        if verdict["difference"]
+                        f"{row['verdict']} {row['difference'].removesuffix(' points')}"
+                        for name in names
+                        for row in (claim_row(name, effect) for effect in recorded[name]["effects"])
+                        if row["difference"]
                     }
                     count += bool(VERDICT.fullmatch(cell))
                     if cell not in found | {"not tested", "-"}:

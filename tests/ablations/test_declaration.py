@@ -40,7 +40,7 @@ def test_a_declaration_is_written_first_and_kept(tiny, tmp_path, monkeypatch, ca
     assert seen == [declared] * 6
     assert declared["begun"] == 0
     assert (declared["primary"], declared["negative_control"]) == ("all/recall", "all/DET_l")
-    assert declared["claims"] == [{"treatment": "tfm", "control": None, "text": ""}]
+    assert declared["claims"] == [{"treatment": "tfm", "control": None, "text": "", "paper": []}]
     text = (out / "effects.md").read_text()
     assert "Declared before any run" in text
     assert "level 0.01, 3 seeds" in text

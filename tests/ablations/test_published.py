@@ -10,7 +10,7 @@ from tests.shared import ROOT
 from tflane_jax.ablations import published
 from tflane_jax.ablations.published import page, record
 from tflane_jax.cli import main
-from tflane_jax.errors import install
+from tflane_jax.errors import UserError, install
 
 
 def test_the_page_leaves_out_best_checkpoints_that_repeat_the_last(tmp_path):
@@ -26,7 +26,7 @@ def test_the_page_leaves_out_best_checkpoints_that_repeat_the_last(tmp_path):
         "rows": rows,
     }
     summary |= {"cores of a run": [1], "commits": [], "devices": [], "core minutes of a run": {"a": 1.0}}
-    summary |= {"findings": [], "quoted": {"rows": []}}
+    summary |= {"findings": [], "effects": [], "runs begun": 0, "quoted": {"rows": []}}
     (tmp_path / "x.json").write_text(json.dumps(summary))
     written = page(tmp_path)
     lines = [line.split() for line in written.splitlines() if line.startswith(("| a", "| b"))]
@@ -72,7 +72,7 @@ def test_a_table_of_fewer_runs_is_told_from_the_recorded_one(tmp_path):
 def test_a_remark_on_several_tables_stands_on_the_page_once(tmp_path):
     summary = dict.fromkeys(("title", "protocol", "declared"), "x") | {"seeds": [0], "steps": [1], "rows": []}
     summary |= {"cores of a run": [1], "commits": [], "devices": [], "core minutes of a run": {"a": 1.0}}
-    summary |= {"findings": [], "quoted": {"rows": []}}
+    summary |= {"findings": [], "effects": [], "runs begun": 0, "quoted": {"rows": []}}
     notes = {"x1": "Of one core.", "x2": "Of one core.", "x3": "Of two.", "x4": None}
     for name, note in notes.items():
         (tmp_path / f"{name}.json").write_text(json.dumps(summary | {"table": name, "note": note}))
@@ -84,11 +84,11 @@ def test_a_remark_on_several_tables_stands_on_the_page_once(tmp_path):
 def test_the_page_names_tables_whose_claims_were_declared_late(tmp_path):
     summary = dict.fromkeys(("title", "protocol"), "x") | {"seeds": [0], "steps": [1], "rows": []}
     summary |= {"cores of a run": [1], "commits": [], "devices": [], "core minutes of a run": {"a": 1.0}}
-    found = "**shown**: a is better than *b* in all/DET_l, +1.00 points (p 0.0100, better in 3 of 3 seeds)"
-    summary |= {"findings": [found], "quoted": {"rows": []}}
-    when = {"x1": "before any run", "x2": "when 1 run had begun already", "x3": "when 12 runs had begun already"}
-    for name, words in when.items():
-        (tmp_path / f"{name}.json").write_text(json.dumps(summary | {"table": name, "declared": f"Declared {words}."}))
+    effect = dict.fromkeys(("claim", "low", "high")) | {"treatment": "a", "control": "b", "paper": [], "further": []}
+    effect |= {"measure": "all/DET_l", "verdict": "shown", "difference": 0.01, "p": 0.01, "better": 3, "seeds": 3}
+    summary |= {"findings": ["a is better"], "effects": [effect], "declared": "In any words.", "quoted": {"rows": []}}
+    for name, begun in {"x0": None, "x1": 0, "x2": 1, "x3": 12}.items():
+        (tmp_path / f"{name}.json").write_text(json.dumps(summary | {"table": name, "runs begun": begun}))
     assert "when some of their runs had begun (how many): x2 (1), x3 (12);" in page(tmp_path).replace("\n", " ")
     for name in ("x2", "x3"):
         (tmp_path / f"{name}.json").unlink()
@@ -99,7 +99,7 @@ def test_the_page_tells_which_rows_made_how_many_updates(tmp_path):
     """Regression: "2000, 4000 updates a run"."""
     summary = dict.fromkeys(("table", "title", "protocol", "declared"), "x") | {"seeds": [0], "rows": []}
     summary |= {"cores of a run": [1], "commits": [], "devices": [], "core minutes of a run": {"a": 1.0}}
-    summary |= {"findings": [], "quoted": {"rows": []}}
+    summary |= {"findings": [], "effects": [], "runs begun": 0, "quoted": {"rows": []}}
     hosts = {"a": 20, "A host": 40, "b": 20, "B host": 40, "c": 20, "long": 80}
     told = {
         "1 seed, 20 updates a run, each on 1 core": {"a": 20, "b": 20},
@@ -126,6 +126,31 @@ def test_another_json_file_is_named_before_anything_is_trained(tmp_path, capsys,
         assert main([*command, "--record", str(tmp_path)]) == 2
         assert "sweep.json" in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["sweep.json"]
+
+
+def test_a_summary_of_an_earlier_version_is_named_before_anything_is_trained(tmp_path, capsys):
+    """It has sentences alone, from which nothing is read."""
+    summary = json.loads((ROOT / "docs" / "results" / "markers.3.json").read_text())
+    del summary["effects"]
+    folder = tmp_path / "results"
+    folder.mkdir()
+    (folder / "markers.3.json").write_text(json.dumps(summary))
+    for command in (["tables"], ["tables", "markers.4", "--out", str(tmp_path / "out")]):
+        assert main([*command, "--record", str(folder)]) == 2
+        message = capsys.readouterr().err
+        assert "markers.3.json is the summary of an earlier version" in message
+        assert "(tflane tables markers.3 --finished --from FOLDER --record FOLDER)" in message
+    assert [path.name for path in tmp_path.iterdir()] == ["results"]
+    with pytest.raises(UserError, match="summary of an earlier version"):
+        record([folder / "markers.3.json"], tmp_path / "others")
+    assert not (tmp_path / "others").exists()
+
+
+def test_the_remark_on_sentences_of_an_earlier_version_stands_below_them(tmp_path):
+    content = json.loads((ROOT / "docs" / "results" / "small_host.1.json").read_text())
+    for remark in ("No interval over scenes: decided by seeds alone.", ""):
+        (tmp_path / "x.json").write_text(json.dumps(content | {"remark on findings": remark}))
+        assert ("\n\nNo interval over scenes: decided by seeds alone.\n" in page(tmp_path)) == bool(remark)
 
 
 def test_without_matplotlib_the_page_has_no_pictures_beside_it(tmp_path, monkeypatch, capsys):

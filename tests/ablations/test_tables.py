@@ -108,6 +108,9 @@ def test_a_table_from_training_to_page(tiny, tmp_path, monkeypatch, capsys):
     assert summary["cores of a run"]
     assert len(summary["findings"]) == 2
     assert "Claim: it helps" in summary["findings"][0]
+    rows = [(effect["treatment"], effect["control"], effect["claim"]) for effect in summary["effects"]]
+    assert rows == [("tfm", "base", "it helps"), ("tfm, no traffic flow at inference", "base", "")]
+    assert summary["runs begun"] == 0
 
     rows = small(tiny).configs(small(tiny).rows)
     (job, *_), *_ = stored_jobs(rows, range(2), out / "runs", threads=workers.worker_threads(1)).values()

@@ -30,6 +30,24 @@ _SECONDARY, _CONFIGURATIONS = "secondary", "configurations"
 
 
 @dataclass(frozen=True)
+class Reported:
+    """A difference that a paper reports, of its own data.
+
+    Attributes:
+        difference: treatment minus control, points.
+        measure: the paper's name of it, such as "DET_l".
+        decimals: that the paper prints.
+    """
+
+    difference: float
+    measure: str
+    decimals: int = 1
+
+    def __str__(self) -> str:
+        return f"{self.difference:+.{self.decimals}f} {self.measure}"
+
+
+@dataclass(frozen=True)
 class Claim:
     """A row is better than another one in the primary measure.
 
@@ -37,11 +55,13 @@ class Claim:
         treatment: row whose effect is tested: a model, or "model, intervention".
         control: row that it is compared with; None for every other model, and the interventions on the treatment.
         text: what a paper claims, in words; "" for none.
+        paper: what it reports, which the words quote; () for no number.
     """
 
     treatment: str
     control: str | None = None
     text: str = ""
+    paper: tuple[Reported, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -17,9 +17,6 @@ from tflane_jax.evaluation.by_scene import SAMPLES as SHARED_SAMPLES
 from tflane_jax.metrics.directions import unit_of
 from tflane_jax.plots.tables import format_table, save_table
 
-HAS_INTERVAL = "95 %"
-NO_INTERVAL = "no interval over scenes: decided by seeds alone"
-
 
 def save_effects(
     results: Results, declared: Declared, test: str, tested: Tested, stem: Path, *, no_drives: str = ""
@@ -55,11 +52,16 @@ def save_effects(
 
 def findings(tested: Tested) -> list[str]:
     """Return a sentence for each claim and row, about the last checkpoint; those without any result last."""
-    by_row: dict[tuple[Claim, str], list[Effect]] = {}
+    return [*map(sentence, by_row(tested)), *map(_without_result, tested.untested)]
+
+
+def by_row(tested: Tested) -> list[list[Effect]]:
+    """Return the effects at the last checkpoint for each claim and row, in every measure, the primary one first."""
+    found: dict[tuple[Claim, str], list[Effect]] = {}
     for effect in tested.effects:
         if effect.checkpoint == "last":
-            by_row.setdefault((effect.claim, effect.row), []).append(effect)
-    return [*map(sentence, by_row.values()), *map(_without_result, tested.untested)]
+            found.setdefault((effect.claim, effect.row), []).append(effect)
+    return list(found.values())
 
 
 def _without_result(untested: Untested) -> str:
@@ -102,22 +104,28 @@ def _numbers(effect: Effect, score: str) -> str:
     """
     if math.isnan(effect.difference):
         return "no number"
-    factor, unit = unit_of(score)
-    unit = "points" if unit == "percent" else unit
+    factor, unit = points(score)
     low, high = factor * effect.low, factor * effect.high
-    parts = [] if math.isnan(effect.low) else [f"{HAS_INTERVAL} {low:+.2f} to {high:+.2f}"]
+    parts = [] if math.isnan(effect.low) else [f"95 % {low:+.2f} to {high:+.2f}"]
     if effect.finding == "not tested":
         return " ".join([f"{factor * effect.difference:+.2f} {unit}", *(f"({part})" for part in parts)])
-    parts += [_p_value(effect.p_holm), f"better in {effect.better} of {len(effect.seeds)} seeds"]
-    parts += [NO_INTERVAL] if math.isnan(effect.low) else []
+    parts += [f"p {told_p(effect.p_holm)}", f"better in {effect.better} of {len(effect.seeds)} seeds"]
+    parts += ["no interval over scenes: decided by seeds alone"] if math.isnan(effect.low) else []
     low, high = (factor * end for end in effect.bias_corrected)
     if effect.finding != "not shown" and low <= 0 <= high:
         parts.append(f"but corrected for bias the interval is {low:+.2f} to {high:+.2f}")
     return f"{factor * effect.difference:+.2f} {unit} ({', '.join(parts)})"
 
 
-def _p_value(p: float) -> str:
-    return f"p {p:.4f}" if p >= 1e-4 else "p < 0.0001"
+def points(score: str) -> tuple[float, str]:
+    """Return by what a difference in a score is multiplied for people, and its unit then: points of percent, or m."""
+    factor, unit = unit_of(score)
+    return factor, "points" if unit == "percent" else unit
+
+
+def told_p(p: float) -> str:
+    """Return p as people read it: four decimals, or that it is smaller than those can tell."""
+    return f"{p:.4f}" if p >= 1e-4 else "< 0.0001"
 
 
 def _rows(results: Results, declaration: Declaration, test: str, tested: Tested) -> list[dict[str, Any]]:

@@ -10,10 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from tflane_jax.ablations.archive import merged, read_archive, write_archive
-from tflane_jax.ablations.findings import HAS_INTERVAL, NO_INTERVAL
+from tflane_jax.ablations.effect_records import Record, claim_row, records_of
 from tflane_jax.ablations.reuse import FILE, archive_path
 from tflane_jax.ablations.tables import TABLES
-from tflane_jax.ablations.verdicts import verdicts
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import write_text
 from tflane_jax.files.fields import load_json, member
@@ -40,12 +39,13 @@ def record(summaries: Sequence[Path], folder: Path) -> Path:
     recorded.
 
     Raises:
-        UserError: a summary is of a quick run, or what was recorded before is damaged.
+        UserError: a summary is of a quick run or of an earlier version, or what was recorded before is damaged.
     """
     for path in summaries:
         content = load_json(path)
         if member(content, "quick", str(path)):
             raise UserError(f"{path} is of a quick run, which is a smoke test and no result")
+        _check(content, path)
         name = member(content, "table", str(path))
         new, place = read_archive(path.with_name(FILE)), archive_path(folder, name)
         write_archive(place, merged(read_archive(place), new) if place.exists() else new)
@@ -84,17 +84,17 @@ def _seeds_by_row(summary: Mapping[str, Any]) -> dict[str, int]:
 def draw_claims(folder: Path) -> None:
     """Draw the claims of a folder of summaries: a picture for each group of tables, such as `markers.png`."""
     found = summaries(folder)
+    headings = {name: (_heading(summary), _if_interim(summary)) for name, summary in found.items()}
     for group, claims in _drawn(found).items():
-        headings = {name: (_heading(summary), _if_interim(summary)) for name, summary in found.items()}
         save_claims(folder / f"{group}.png", claims, headings)
 
 
-def _drawn(found: Mapping[str, Mapping[str, Any]]) -> dict[str, list[dict[str, str | None]]]:
-    """Return the claims with a number by group, which is what stands before the first dot of a table's name."""
-    groups: dict[str, list[dict[str, str | None]]] = {}
+def _drawn(found: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, list[Record]]]:
+    """Return the claims with a number, by group and table; a group is what stands before the first dot of a name."""
+    groups: dict[str, dict[str, list[Record]]] = {}
     for name, summary in found.items():
-        if claims := [row for row in verdicts({name: summary}) if row["difference"] not in (None, "no number")]:
-            groups.setdefault(name.partition(".")[0], []).extend(claims)
+        if claims := [record for record in summary["effects"] if record["difference"] is not None]:
+            groups.setdefault(name.partition(".")[0], {})[name] = claims
     return groups
 
 
@@ -114,7 +114,7 @@ def page(folder: Path) -> str:
         "same.",
     ]
     linked = {f"[{name}](#{_anchor(each)}){_if_interim(each)}": each for name, each in found.items()}
-    if claims := verdicts(linked):
+    if claims := [claim_row(name, record) for name, each in linked.items() for record in each["effects"]]:
         lines += ["", "## All claims", "", *_wrapped(_CLAIMS + _declared_late(found)), "", format_table(claims)]
         for group in _drawn(found):
             lines += ["", f"![Claims of {group}]({folder.name}/{group}.png)"]
@@ -135,8 +135,7 @@ def page(folder: Path) -> str:
 
 def _declared_late(found: Mapping[str, Mapping[str, Any]]) -> str:
     """Return a sentence that names the tables whose claims were declared when runs of theirs had begun; "" for none."""
-    counts = {name: re.match(r"Declared when (\d+) runs? had begun", each["declared"]) for name, each in found.items()}
-    late = [f"{name} ({count[1]})" for name, count in counts.items() if count]
+    late = [f"{name} ({summary['runs begun']})" for name, summary in found.items() if summary["runs begun"]]
     if not late:
         return ""
     return (
@@ -146,12 +145,22 @@ def _declared_late(found: Mapping[str, Mapping[str, Any]]) -> str:
 
 
 def summaries(folder: Path) -> dict[str, Mapping[str, Any]]:
-    """Return the summaries of a folder by name, in the order of the tables; raise UserError for another JSON file."""
+    """Return the summaries of a folder by name, in the order of the tables.
+
+    Raises UserError for another JSON file, and for a summary of an earlier version.
+    """
     found = {path.stem: load_json(path) for path in folder.glob("*.json")}
     for name, summary in found.items():
-        for field in ("table", "findings", "rows", "quoted"):
-            member(summary, field, str(folder / f"{name}.json"))
+        _check(summary, folder / f"{name}.json")
     return {name: found[name] for name in (*TABLES, *sorted(found.keys() - TABLES.keys())) if name in found}
+
+
+def _check(summary: Any, path: Path) -> None:
+    """Raise UserError for a file that is no summary, or one without what this version reads."""
+    for field in ("table", "findings", "rows", "quoted"):
+        member(summary, field, str(path))
+    records_of(summary, str(path))
+    member(summary, "runs begun", str(path))
 
 
 def _heading(summary: Mapping[str, Any]) -> str:
@@ -212,9 +221,8 @@ def _section(summary: Mapping[str, Any], note: str | None) -> list[str]:
         lines += [*_wrapped(note), ""]
     for finding in summary["findings"]:
         lines += _wrapped(f"{finding}.", first="- ", rest="  ")
-    told = any(text in finding for finding in summary["findings"] for text in (HAS_INTERVAL, NO_INTERVAL))
-    if summary["findings"] and not told:
-        lines += ["", f"{NO_INTERVAL[0].upper()}{NO_INTERVAL[1:]}."]  # earlier summaries do not say it
+    if remark := summary.get("remark on findings"):  # of an earlier version, whose sentences do not say it
+        lines += ["", *_wrapped(remark)]
     quoted = summary["quoted"]
     if quoted["rows"]:
         lines += ["", *_wrapped(f"The paper's own numbers: {quoted['source']}."), ""]

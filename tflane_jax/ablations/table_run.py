@@ -24,6 +24,7 @@ from tflane_jax.ablations.archive import Archive
 from tflane_jax.ablations.comparison import compact
 from tflane_jax.ablations.declaration import FILE as DECLARATION
 from tflane_jax.ablations.declaration import Declared, declare
+from tflane_jax.ablations.effect_records import effect_records
 from tflane_jax.ablations.effects import Tested, judged_claims
 from tflane_jax.ablations.facts import facts, mixed_hosts, row_minutes
 from tflane_jax.ablations.findings import findings, save_effects
@@ -330,6 +331,7 @@ def _save_summary(
             **({"steps factor": table.steps_factor} if table.steps_factor > 1 else {}),
             "protocol": results.protocol(),
             "declared": declared.sentence(),
+            "runs begun": declared.begun,
             "note": table.note,
             "models": list(results.models),
             "seeds": list(results.seeds),
@@ -342,6 +344,7 @@ def _save_summary(
             "core minutes of a run": row_minutes(trained),
             "rows": _rows(table, results),
             "findings": findings(tested),
+            "effects": effect_records(tested),
             "quoted": asdict(table.quoted),
         },
     )

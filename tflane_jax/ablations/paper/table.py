@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from tflane_jax.ablations.declaration import Claim, Declaration
+from tflane_jax.ablations.declaration import Claim, Declaration, Reported
 from tflane_jax.config import RunConfig, load_config, loaded_once, with_step_counts
 from tflane_jax.config_io import with_setting
 from tflane_jax.config_overrides import apply_overrides
@@ -158,6 +158,11 @@ class PaperTable:
                 config = longer(config, self.steps_factor)
                 found[row.name] = shortened(config) if quick else config
         return found
+
+
+def claim(treatment: str, control: str, text: str, *reported: Reported) -> Claim:
+    """Return a claim whose words quote what the paper reports, in the place of "{}"."""
+    return Claim(treatment, control, text.format(", ".join(map(str, reported))), reported)
 
 
 def longer(config: RunConfig, factor: int) -> RunConfig:

@@ -9,14 +9,18 @@ ablations on LaneSegNet and are decided by its mAP.
 
 from __future__ import annotations
 
-from tflane_jax.ablations.declaration import Claim
-from tflane_jax.ablations.paper.table import PaperTable, Quoted, TableRow
+from functools import partial
+
+from tflane_jax.ablations.declaration import Claim, Reported
+from tflane_jax.ablations.paper.table import PaperTable, Quoted, TableRow, claim
 from tflane_jax.evaluation.interventions import NO_TRAFFIC
 
 _OPENLANE = "OpenLane-V2 subset A, validation split; 60 epochs, * best epoch of the baseline and of ours"
 _NUSCENES = "nuScenes, validation split, Chamfer AP in percent; 60 epochs, * best epoch"
 _LANESEGNET = f"{_OPENLANE}; LaneSegNet's metrics, percent; AP_ped is printed AP_pred"
 _GROUPS = ("hidden+traffic/recall", "hidden-traffic/recall")
+_WITHOUT = f"LaneSegNet + TFM, {NO_TRAFFIC}"
+_gain = partial(Reported, measure="mAP", decimals=2)
 _SEGMENTS = ("all/mAP", "all/AP_ls", "all/AP_ped", "all/TOP_lsls")
 _LINES = ("lines/mAP", "lines/AP_divider", "lines/AP_ped_crossing", "lines/AP_boundary")
 
@@ -37,7 +41,7 @@ def _with_and_without(
     steps: int,
     minutes: float,
     quoted: Quoted,
-    text: str,
+    first: tuple[str, *tuple[Reported, ...]],
     note: str = "",
 ) -> PaperTable:
     """Return the table of one host: without and with the TFM, each traffic reading, and the controls."""
@@ -54,7 +58,7 @@ def _with_and_without(
             TableRow(f"{bev}, control", f"tf_lane/{host}_tfm:street_bev_control"),
         ),
         claims=(
-            Claim(tfm, label, text),
+            claim(tfm, label, *first),
             Claim(tfm, f"{tfm}, control", "the gain is the traffic's, not the added layers'"),
             Claim(bev, label, "ours: traffic in the BEV features as well"),
             Claim(bev, f"{bev}, control", "the gain is the traffic's, not the added layers'"),
@@ -129,7 +133,7 @@ TABLES = (
                 "LaneSegNet + TFM *": (35.66, 34.52, 36.79, 27.50),
             },
         ),
-        text="traffic flow improves LaneSegNet (+2.03 mAP)",
+        first=("traffic flow improves LaneSegNet ({})", _gain(2.03)),
     ),
     _with_and_without(
         2,
@@ -151,7 +155,7 @@ TABLES = (
                 "TopoNet + TFM *": (42.39, 31.22, 47.44, 15.97, 25.96),
             },
         ),
-        text="traffic flow improves TopoNet (+0.19 DET_l, +1.17 OLS)",
+        first=("traffic flow improves TopoNet ({})", Reported(0.19, "DET_l", 2), Reported(1.17, "OLS", 2)),
         note="There is no DET_t, TOP_lt and OLS: BEV evidence shows no traffic elements, so this host predicts none. "
         "The gains in the first claim are the paper's.",
     ),
@@ -175,7 +179,7 @@ TABLES = (
                 "MapTR + TFM *": (55.80, 58.75, 51.10, 57.57),
             },
         ),
-        text="traffic flow improves MapTR (+4.1 mAP)",
+        first=("traffic flow improves MapTR ({})", Reported(4.1, "mAP")),
     ),
     _with_and_without(
         4,
@@ -197,19 +201,19 @@ TABLES = (
                 "MapTRv2 + TFM *": (63.50, 63.65, 61.76, 65.09),
             },
         ),
-        text="traffic flow improves MapTRv2 (+1.31 mAP)",
+        first=("traffic flow improves MapTRv2 ({})", _gain(1.31)),
     ),
     _on_lanesegnet(
         5,
         "architecture of the TFM: fusion modules, depth, normalised coordinates",
         (*map(_ablation, _ARCHITECTURE), _BEST_ROW, *map(_ablation, ("abla1_spatial", "abla3_spatial"))),
         (
-            Claim("abla2", "abla1", "one layer is better than three, with all four fusion modules (+1.26 mAP)"),
+            claim("abla2", "abla1", "one layer is better than three, with all four fusion modules ({})", _gain(1.26)),
             Claim("abla2", "abla1_spatial", "the same, depth read as layers of the spatial encoder"),
-            Claim("abla4", "abla3", "the text: reducing depth helps; the table: -0.89 mAP with LT/LL"),
+            claim("abla4", "abla3", "the text: reducing depth helps; the table: {} with LT/LL", _gain(-0.89)),
             Claim("abla4", "abla3_spatial", "the same, depth read as layers of the spatial encoder"),
-            Claim("abla5", "abla4", "normalised coordinates help (+1.93 mAP)"),
-            Claim("abla5", "LaneSegNet", "the best setting improves LaneSegNet (+2.03 mAP)"),
+            claim("abla5", "abla4", "normalised coordinates help ({})", _gain(1.93)),
+            claim("abla5", "LaneSegNet", "the best setting improves LaneSegNet ({})", _gain(2.03)),
         ),
         _quoted(
             _LANESEGNET,
@@ -230,9 +234,9 @@ TABLES = (
         "number of road users and least number of valid frames, on `city`",
         tuple(TableRow(name, f"tf_lane/lanesegnet_tfm:{name}_city") for name in ("abla6", "abla7", "abla8")),
         (
-            Claim("abla7", "abla6", "30 road users are better than 20 (+0.98 mAP)"),
-            Claim("abla7", "abla8", "a threshold of 5 frames is better than 10 (+1.12 mAP)"),
-            Claim("abla7", "LaneSegNet", "the best setting improves LaneSegNet (+2.03 mAP)"),
+            claim("abla7", "abla6", "30 road users are better than 20 ({})", _gain(0.98)),
+            claim("abla7", "abla8", "a threshold of 5 frames is better than 10 ({})", _gain(1.12)),
+            claim("abla7", "LaneSegNet", "the best setting improves LaneSegNet ({})", _gain(2.03)),
         ),
         _quoted(
             _LANESEGNET,
@@ -254,13 +258,14 @@ TABLES = (
             TableRow("LaneSegNet + TFM, control", "tf_lane/lanesegnet_tfm:street_control"),
         ),
         (
-            Claim(
-                f"LaneSegNet + TFM, {NO_TRAFFIC}",
+            claim(
+                _WITHOUT,
                 "LaneSegNet",
-                "a model trained with traffic flow is better than the baseline even without it (+1.33 mAP)",
+                "a model trained with traffic flow is better than the baseline even without it ({})",
+                _gain(1.33),
             ),
-            Claim(f"LaneSegNet + TFM, {NO_TRAFFIC}", "LaneSegNet + TFM, control", "and the traffic in training is why"),
-            Claim("LaneSegNet + TFM", f"LaneSegNet + TFM, {NO_TRAFFIC}", "traffic flow at inference helps (+0.70 mAP)"),
+            Claim(_WITHOUT, "LaneSegNet + TFM, control", "and the traffic in training is why"),
+            claim("LaneSegNet + TFM", _WITHOUT, "traffic flow at inference helps ({})", _gain(0.70)),
         ),
         _quoted(
             _LANESEGNET,
@@ -268,7 +273,7 @@ TABLES = (
             **{
                 "LaneSegNet": ("-", "-", *_BASELINE),
                 "LaneSegNet + TFM": (30, 30, *_BEST),
-                f"LaneSegNet + TFM, {NO_TRAFFIC}": (30, 0, 34.32, 33.54, 35.10, 27.82),
+                _WITHOUT: (30, 0, 34.32, 33.54, 35.10, 27.82),
             },
         ),
         minutes=7.5,

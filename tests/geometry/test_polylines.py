@@ -22,6 +22,8 @@ from tflane_jax.geometry.polylines import (
     pad_lines,
     resample,
     sample_at,
+    simplify,
+    without_repeats,
 )
 
 QUICK = settings(max_examples=60)
@@ -237,3 +239,42 @@ def test_pad_lines_without_lines_or_points():
     assert pad_lines([]).shape[::2] == (0, 3)
     with pytest.raises(ValueError, match="polyline 1 has no points"):
         pad_lines([np.zeros((2, 3)), np.zeros((0, 3))])
+
+
+@settings(max_examples=40)
+@given(st.integers(0, 1000), st.integers(1, 30), st.floats(0.01, 5.0))
+def test_simplified_lines_stay_within_the_tolerance(seed, count, tolerance):
+    line = np.cumsum(np.random.default_rng(seed).normal(size=(count, 2)), 0)
+    short = simplify(line, tolerance)
+    np.testing.assert_array_equal(short[[0, -1]], line[[0, -1]])
+    assert len(short) <= len(line)
+    if len(short) > 1:
+        assert max(LineString(short).distance(Point(point)) for point in line) <= tolerance + 1e-9
+    np.testing.assert_array_equal(simplify(line, 0.0), line)
+
+
+def test_simplifying_drops_points_on_a_straight_line():
+    line = np.stack([np.arange(9.0), np.zeros(9)], -1)
+    np.testing.assert_array_equal(simplify(line, 0.1), line[[0, -1]])
+    angle = np.linspace(0, 2 * np.pi, 49)
+    ring = 15 * np.stack([np.cos(angle), np.sin(angle)], -1)
+    ring[-1] = ring[0]
+    # Chords of 22.5 degrees miss the circle by 0.3 m, of 45 degrees by 1.1 m.
+    assert len(simplify(ring, 1.0)) == 17
+
+
+def test_lines_are_simplified_in_the_ground_plane():
+    line = random_line(3, 40)
+    short = simplify(line, 4.0)
+    assert 2 < len(short) < 40
+    np.testing.assert_array_equal(short[:, :2], simplify(line[:, :2], 4.0))
+    assert {tuple(point) for point in short} <= {tuple(point) for point in line}
+
+
+@pytest.mark.parametrize("dims", [2, 3])
+def test_points_that_repeat_the_one_before_are_left_out(dims):
+    line = np.array([[0, 0, 0], [0.05, 0, 9], [0.1, 0, 0], [1, 0, 0], [1, 0.3, 0], [1, 0.3, 5]])[:, :dims]
+    assert without_repeats(line, 0.1)[:, :2].tolist() == [[0, 0], [1, 0], [1, 0.3]]
+    np.testing.assert_array_equal(without_repeats(line, 0.0), line[:5])
+    for count in (0, 1):
+        assert without_repeats(line[:count], 0.1).shape == (count, dims)

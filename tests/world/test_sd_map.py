@@ -5,8 +5,6 @@ from dataclasses import replace
 import jax
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from tests.datasets.small_logs import lane_map, log, segment, tracks
 from tflane_jax.datasets.base import ExampleConfig, TruncationWarning
@@ -21,7 +19,6 @@ from tflane_jax.world.roads.sd_map import (
     gnss_error,
     make_sd_map,
     pack_lines,
-    simplify,
     survey_error,
 )
 
@@ -141,28 +138,6 @@ def test_same_seed_same_bits_another_seed_another_map():
     jax.tree.map(np.testing.assert_array_equal, later, make(5, 1))
     assert 0 < np.abs(later.points - first.points).max() < 0.2
     assert np.abs(make(6, 0).points - first.points).max() > 0.2
-
-
-@settings(max_examples=40)
-@given(st.integers(0, 1000), st.integers(1, 30), st.floats(0.01, 5.0))
-def test_simplified_lines_stay_within_the_tolerance(seed, count, tolerance):
-    line = np.cumsum(np.random.default_rng(seed).normal(size=(count, 2)), 0)
-    short = simplify(line, tolerance)
-    np.testing.assert_array_equal(short[[0, -1]], line[[0, -1]])
-    assert len(short) <= len(line)
-    if len(short) > 1:
-        assert distance_to(line, short).max() <= tolerance + 1e-9
-    np.testing.assert_array_equal(simplify(line, 0.0), line)
-
-
-def test_simplifying_drops_points_on_a_straight_line():
-    line = np.stack([np.arange(9.0), np.zeros(9)], -1)
-    np.testing.assert_array_equal(simplify(line, 0.1), line[[0, -1]])
-    angle = np.linspace(0, 2 * np.pi, 49)
-    ring = 15 * np.stack([np.cos(angle), np.sin(angle)], -1)
-    ring[-1] = ring[0]
-    # Chords of 22.5 degrees miss the circle by 0.3 m, of 45 degrees by 1.1 m.
-    assert len(simplify(ring, 1.0)) == 17
 
 
 def test_beyond_capacity_the_nearest_pieces_stay_in_order():

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from tflane_jax.datasets.plausible import check_steps, first_twice, left_of
-from tflane_jax.errors import UserError, missing_extra
+from tflane_jax.datasets.shapely_polygons import flat_rings, import_shapely
+from tflane_jax.errors import UserError
 from tflane_jax.files.fields import items, load_json, member, numbers, whole_number
 from tflane_jax.geometry.polylines import resample
 from tflane_jax.scene import LineType
@@ -125,17 +126,14 @@ def _crossing(record: Any, where: str) -> np.ndarray:
 
 def _boundaries(areas: list[np.ndarray]) -> tuple[np.ndarray, ...]:
     """Return the closed rings of the union of drivable areas, each point at the height of the nearest map vertex."""
-    try:
-        import shapely
-        from scipy.spatial import KDTree
-    except ImportError as error:
-        raise missing_extra("reading Argoverse 2 needs shapely", "data") from error
+    from scipy.spatial import KDTree
+
+    shapely = import_shapely("reading Argoverse 2")
     if not areas:
         return ()
     # A zero buffer repairs rings that touch themselves.
     union = shapely.union_all([shapely.Polygon(a[:, :2]).buffer(0) for a in areas])
-    rings = [ring for part in shapely.get_parts(union) for ring in (part.exterior, *part.interiors)]
+    rings = [ring for part in shapely.get_parts(union) for ring in flat_rings(part)]
     vertices = np.concatenate(areas)
     nearest = KDTree(vertices[:, :2])
-    flat = [np.asarray(ring.coords)[:, :2] for ring in rings]
-    return tuple(np.column_stack([ring, vertices[nearest.query(ring)[1], 2]]) for ring in flat)
+    return tuple(np.column_stack([ring, vertices[nearest.query(ring)[1], 2]]) for ring in rings)

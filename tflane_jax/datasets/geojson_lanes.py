@@ -30,6 +30,7 @@ from tflane_jax.datasets.plausible import check_steps
 from tflane_jax.errors import UserError
 from tflane_jax.files.fields import as_list
 from tflane_jax.files.wording import shown
+from tflane_jax.geometry import without_repeats
 from tflane_jax.scene import LineType
 from tflane_jax.scene.logs import LaneSegment, Side, VectorMap
 from tflane_jax.world.roads.map_roadside import lane_points
@@ -169,7 +170,7 @@ def _segments(lanes: Mapping[str, tuple[np.ndarray, Mapping[str, Any], str]]) ->
 
 def _clean(line: Float[np.ndarray, "n 2"], name: str) -> Float[np.ndarray, "m 2"]:
     """Return a line without points that repeat the one before."""
-    line = line[np.concatenate([[True], np.linalg.norm(np.diff(line, axis=0), axis=-1) > 1e-3])]
+    line = without_repeats(line, 1e-3)
     if len(line) < 2:
         raise UserError(f"{name} is a lane without length: take it out")
     return line

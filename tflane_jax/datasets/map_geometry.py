@@ -17,9 +17,10 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from tflane_jax.datasets.packed_lines import PackedLines
-from tflane_jax.errors import UserError, missing_extra
+from tflane_jax.datasets.shapely_polygons import flat_rings, import_shapely
+from tflane_jax.errors import UserError
 from tflane_jax.geometry import PerceptionRange
-from tflane_jax.geometry.polylines import clip_to_range
+from tflane_jax.geometry.polylines import clip_to_range, simplify
 from tflane_jax.geometry.rings import from_first_corner, oriented
 from tflane_jax.scene import LineClass
 
@@ -213,18 +214,13 @@ def _parts(geometry: Any, near: Sequence[np.ndarray]) -> list[list[np.ndarray]]:
     found = []
     for part in _shapely().get_parts(geometry):
         if part.geom_type == "Polygon" and part.area > 0.0:
-            turned = orient(part, -1.0)
-            flat = [np.asarray(ring.coords)[:, :2] for ring in (turned.exterior, *turned.interiors)]
-            found.append([np.column_stack([ring, vertices[nearest.query(ring)[1], 2]]) for ring in flat])
+            rings = flat_rings(orient(part, -1.0))
+            found.append([np.column_stack([ring, vertices[nearest.query(ring)[1], 2]]) for ring in rings])
     return found
 
 
 def _shapely() -> Any:
-    try:
-        import shapely
-    except ImportError as error:
-        raise missing_extra("cutting the areas of a vector map needs shapely", "data") from error
-    return shapely
+    return import_shapely("cutting the areas of a vector map")
 
 
 def join_ends(lines: Sequence[np.ndarray]) -> list[np.ndarray]:
@@ -297,7 +293,7 @@ def lane_paths(
             following[last[before]].append(first[after])
     roots = set(following) - {node for after in following.values() for node in after}
     paths = _simple_paths(sorted(roots), following)
-    return [_simplified(_concatenated([nodes[node] for node in path])) for path in paths]
+    return [simplify(_concatenated([nodes[node] for node in path]), SIMPLIFIED) for path in paths]
 
 
 def _simple_paths(roots: Sequence[int], following: dict[int, list[int]]) -> list[list[int]]:
@@ -324,23 +320,3 @@ def _concatenated(lines: Sequence[np.ndarray]) -> np.ndarray:
     points = np.concatenate(lines)
     new = (points[1:, :2] != points[:-1, :2]).any(-1)
     return points[np.concatenate([[True], new])]
-
-
-def _simplified(line: np.ndarray) -> np.ndarray:
-    """Return the vertices that keep the line within `SIMPLIFIED` in the ground plane (Douglas and Peucker)."""
-    kept = np.zeros(len(line), bool)
-    kept[[0, -1]] = True
-    stack = [(0, len(line) - 1)]
-    while stack:
-        start, stop = stack.pop()
-        if stop - start < 2:
-            continue
-        origin, step = line[start, :2], line[stop, :2] - line[start, :2]
-        apart = line[start + 1 : stop, :2] - origin
-        along = np.clip(apart @ step / max(step @ step, 1e-12), 0.0, 1.0)
-        distance = np.linalg.norm(apart - along[:, None] * step, axis=-1)
-        if distance.max() > SIMPLIFIED:
-            middle = start + 1 + int(distance.argmax())
-            kept[middle] = True
-            stack += [(start, middle), (middle, stop)]
-    return line[kept]

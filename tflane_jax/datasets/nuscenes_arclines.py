@@ -16,6 +16,7 @@ from jaxtyping import Float
 from tflane_jax.datasets.plausible import FARTHEST_STEP
 from tflane_jax.errors import UserError
 from tflane_jax.files.fields import member, numbers
+from tflane_jax.geometry import without_repeats
 
 SHAPES = ("LRL", "RLR", "LSL", "LSR", "RSL", "RSR")
 _TURN = {"L": 1.0, "S": 0.0, "R": -1.0}
@@ -34,12 +35,10 @@ def lane_points(paths: Sequence[Any], resolution: float, where: str) -> Float[np
     """
     parts = [path_poses(path, resolution, f"{where}[{number}]") for number, path in enumerate(paths)]
     points = np.concatenate([np.zeros((0, 3)), *parts])[:, :2].round(3)
-    if not len(points):
-        return points
-    new = np.concatenate([[True], np.linalg.norm(np.diff(points, axis=0), axis=-1) > _SAME_POINT])
-    if not new[-1] and new.sum() > 1:  # the end stays where it is, for the lanes that start there
-        new[[np.flatnonzero(new)[-1], -1]] = False, True
-    return points[new]
+    found = without_repeats(points, _SAME_POINT)
+    if len(found) > 1:  # the end stays where it is, for the lanes that start there
+        found[-1] = points[-1]
+    return found
 
 
 def path_poses(path: Any, resolution: float, where: str) -> Float[np.ndarray, "n 3"]:

@@ -20,7 +20,8 @@ from jaxtyping import Float
 from tflane_jax.datasets.lane_outlines import LaneOutline, boundaries
 from tflane_jax.datasets.nuscenes_arclines import lane_points
 from tflane_jax.datasets.plausible import check_steps
-from tflane_jax.errors import UserError, missing_extra
+from tflane_jax.datasets.shapely_polygons import flat_rings, import_shapely
+from tflane_jax.errors import UserError
 from tflane_jax.files.fields import items, load_json, member, numbers
 from tflane_jax.scene import LineType
 from tflane_jax.scene.logs import LaneSegment, VectorMap
@@ -29,6 +30,8 @@ from tflane_jax.scene.logs import LaneSegment, VectorMap
 RESOLUTION = 0.5
 # Older files lack arclines.
 _FIRST_VERSION = (1, 3)
+# What needs shapely, for the message where it is not installed.
+_PURPOSE = "reading nuScenes maps"
 
 Polygon = tuple[np.ndarray, ...]
 """Rings (n, 2) that repeat their first point, the exterior first."""
@@ -289,25 +292,20 @@ def union_rings(polygons: Sequence[Polygon]) -> list[np.ndarray]:
     parts = [_shape(polygon) for polygon in polygons]
     if not parts:
         return []
-    import shapely
     from shapely.geometry.polygon import orient
 
+    shapely = import_shapely(_PURPOSE)
     union = shapely.union_all([part for part in parts if part.is_valid])
     rings = []
     for part in shapely.get_parts(union):
         if part.geom_type == "Polygon" and not part.is_empty:
-            turned = orient(part, -1.0)
-            rings += [np.asarray(ring.coords)[:, :2] for ring in (turned.exterior, *turned.interiors)]
+            rings += flat_rings(orient(part, -1.0))
     return rings
 
 
 def _shape(polygon: Polygon) -> Any:
     """Return a polygon of shapely; raises UserError if shapely is not installed."""
-    try:
-        import shapely
-    except ImportError as error:
-        raise missing_extra("reading nuScenes maps needs shapely", "data") from error
-    return shapely.Polygon(polygon[0], polygon[1:])
+    return import_shapely(_PURPOSE).Polygon(polygon[0], polygon[1:])
 
 
 def _segment(number: int, lane: ExpansionLane, left: np.ndarray, right: np.ndarray) -> LaneSegment:

@@ -40,7 +40,7 @@ from tflane_jax.errors import UserError
 from tflane_jax.files.fields import member, numbers
 from tflane_jax.files.npz import read_npz
 from tflane_jax.files.wording import shown
-from tflane_jax.geometry import invert_pose, line_distances, transform_points, wrap_angle, yaw_pose
+from tflane_jax.geometry import invert_pose, line_distances, transform_points, without_repeats, wrap_angle, yaw_pose
 from tflane_jax.scene import LineType, RoadUser
 from tflane_jax.scene.logs import KeyFrame, LaneSegment, Log, Tracks, VectorMap
 
@@ -193,7 +193,8 @@ def _vector_map(content: dict[str, Any], path: Path) -> VectorMap:
     for number, (kind, token) in enumerate(elements):
         for key in ("polyline", "polygon"):
             check_steps(content[key][number], f"{path}: {key} of {token}")
-        line, polygon = _different(content["polyline"][number]), content["polygon"][number]
+        # The joints of its arcs are there twice.
+        line, polygon = without_repeats(content["polyline"][number], 1e-4), content["polygon"][number]
         if kind.startswith("LANE_"):
             if len(line) > 1:
                 lanes[number] = LaneOutline(line, polygon if len(polygon) else None)
@@ -223,13 +224,6 @@ def _vector_map(content: dict[str, Any], path: Path) -> VectorMap:
         road_boundaries=tuple(map(flat, border)),
         dividers=tuple(flat(line) for line, _ in dividers),
     )
-
-
-def _different(line: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "m 2"]:
-    """Return a line without points that repeat the one before: the joints of its arcs."""
-    if len(line) < 2:
-        return line
-    return line[np.concatenate([[True], np.linalg.norm(np.diff(line, axis=0), axis=-1) > 1e-4])]
 
 
 def _following(lanes: dict[int, LaneOutline]) -> dict[int, tuple[int, ...]]:

@@ -28,7 +28,7 @@ from tflane_jax.errors import UserError
 from tflane_jax.files.fields import load_json, member
 from tflane_jax.files.openlane import CENTERLINE, SEGMENT
 from tflane_jax.geometry import line_distances, transform_points
-from tflane_jax.geometry.polylines import arc_length, resample_lines, sample_at
+from tflane_jax.geometry.polylines import arc_length, resample_lines, sample_at, without_repeats
 from tflane_jax.scene import AreaType, LineType
 from tflane_jax.scene.logs import LaneSegment, VectorMap
 from tflane_jax.world.roads.road_map import RoadMap
@@ -37,6 +37,8 @@ from tflane_jax.world.roads.road_map import RoadMap
 COMPLETE = 25.0
 # Lines whose mean distance is less are one line, metres; the ends of pieces differ by less than half as much.
 _SAME = 0.75
+# A point this near to the one before repeats it, metres.
+_SAME_POINT = 1e-3
 _POINTS = 41
 # Timestamps of Argoverse 2 are nanoseconds, of more digits; those of nuScenes microseconds.
 _NANOSECONDS = 10**17
@@ -141,7 +143,7 @@ class _Lines:
         kinds: Sequence[Sequence[int]] | np.ndarray = (),
     ) -> None:
         """Take the lines of the next frame, global metres; one without length is passed over."""
-        found = [tuple(_clean(line) for line in parts) for parts in found]
+        found = [tuple(without_repeats(line, _SAME_POINT) for line in parts) for parts in found]
         rows = [row for row, parts in enumerate(found) if len(parts[0]) > 1]
         now, before = [found[row][0] for row in rows], list(self._numbers.values())
         known = same_lines(now, self._before)
@@ -220,7 +222,7 @@ def joined(before: Float[np.ndarray, "n 3"], after: Float[np.ndarray, "m 3"]) ->
     start, end = (_station(before, along, point) for point in (after[0], after[-1]))
     head = before[along < start - 0.5 * _SAME] if start > 0.5 * _SAME else before[:0]
     tail = before[along > end + 0.5 * _SAME] if end < along[-1] - 0.5 * _SAME else before[:0]
-    return _clean(np.concatenate([head, after, tail]))
+    return without_repeats(np.concatenate([head, after, tail]), _SAME_POINT)
 
 
 def _station(line: np.ndarray, along: np.ndarray, point: np.ndarray) -> float:
@@ -247,12 +249,6 @@ def _without_copies(lines: Sequence[np.ndarray]) -> Int[np.ndarray, " n"]:
     while (keep[keep] != keep).any():
         keep = keep[keep]
     return keep
-
-
-def _clean(line: np.ndarray) -> np.ndarray:
-    """Return a line without points that repeat the one before."""
-    apart = np.linalg.norm(np.diff(line[:, :2], axis=0), axis=-1) > 1e-3
-    return line[np.concatenate([[True], apart])]
 
 
 def _plain(line: np.ndarray) -> Float[np.ndarray, "n 3"]:

@@ -21,6 +21,8 @@ from tflane_jax.geometry.polylines import (
     resample_lines,
     sample_at,
     segment_distances,
+    simplify,
+    without_repeats,
 )
 from tflane_jax.geometry.poses import (
     invert_pose,
@@ -56,7 +58,9 @@ __all__ = [
     "resize_intrinsics",
     "sample_at",
     "segment_distances",
+    "simplify",
     "transform_points",
+    "without_repeats",
     "wrap_angle",
     "yaw_pose",
 ]

@@ -90,6 +90,42 @@ def resample_lines(lines: Sequence[Float[np.ndarray, "_ d"]], count: int) -> Flo
     return np.where(weight == 1.0, points[stop], points[start] + weight * (points[stop] - points[start]))
 
 
+def simplify(points: Float[np.ndarray, "n d"], tolerance: float) -> Float[np.ndarray, "k d"]:
+    """Return the vertices of a line that keep all others within `tolerance` metres (Douglas and Peucker 1973).
+
+    Distances are in the ground plane. Both ends stay; 0 keeps every vertex. A closed line is cut at the vertex farthest
+    from its seam.
+    """
+    if tolerance <= 0.0 or len(points) < 3:
+        return points
+    keep = np.zeros(len(points), bool)
+    keep[[0, -1]] = True
+    spans = [(0, len(points) - 1)]
+    while spans:
+        first, last = spans.pop()
+        if last - first < 2:
+            continue
+        origin, step = points[first, :2], points[last, :2] - points[first, :2]
+        away = points[first + 1 : last, :2] - origin
+        fraction = np.clip(away @ step / max(float(step @ step), 1e-12), 0.0, 1.0)
+        distance = np.linalg.norm(away - fraction[:, None] * step, axis=-1)
+        if distance.max() > tolerance:
+            farthest = first + 1 + int(distance.argmax())
+            keep[farthest] = True
+            spans += [(first, farthest), (farthest, last)]
+    return points[keep]
+
+
+def without_repeats(points: Float[np.ndarray, "n d"], tolerance: float) -> Float[np.ndarray, "k d"]:
+    """Return a line without the points that lie within `tolerance` metres of the one before, in the ground plane.
+
+    The point before may itself be left out: of many points in small steps only the first stays.
+    """
+    kept = np.ones(len(points), bool)
+    kept[1:] = np.linalg.norm(np.diff(points[:, :2], axis=0), axis=-1) > tolerance
+    return points[kept]
+
+
 def pad_lines(
     lines: Sequence[Float[np.ndarray, "_ d"]] | Float[np.ndarray, "l n d"], dims: int = 3
 ) -> Float[np.ndarray, "l n d"]:

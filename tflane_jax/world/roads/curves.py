@@ -178,15 +178,12 @@ def blend(
     return xy + before * u[:, None] + after * v[:, None], np.arctan2(slope[..., 1], slope[..., 0])
 
 
+# `geometry.arc_length` and `sample_at` do the same and round differently, in the last bits (np.hypot and np.interp
+# here). Roads stand and traffic drives where these two put them: with the others, scenes of recorded runs would change.
 def arc_length(points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
     """Return the distance along the line to each point, metres."""
     steps = np.diff(points, axis=0)
     return np.concatenate([[0.0], np.cumsum(np.hypot(steps[:, 0], steps[:, 1]))])
-
-
-def line_length(line: Float[np.ndarray, "n d"]) -> float:
-    """Return the length of a line in the ground plane, metres."""
-    return float(np.linalg.norm(np.diff(line[:, :2], axis=0), axis=-1).sum())
 
 
 def points_at(line: Float[np.ndarray, "n 2"], distances: Float[np.ndarray, " k"]) -> Float[np.ndarray, "k 2"]:

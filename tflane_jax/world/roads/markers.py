@@ -13,10 +13,10 @@ from typing import Annotated, Literal
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from tflane_jax.geometry import pose_matrix, segment_distances, wrap_angle
+from tflane_jax.geometry import arc_length, line_lengths, pose_matrix, segment_distances, wrap_angle
 from tflane_jax.limits import Positive, PositiveOrZero, within
 from tflane_jax.scene.logs import LaneSegment, PlacedMarkers, VectorMap
-from tflane_jax.world.roads.curves import cross, line_length
+from tflane_jax.world.roads.curves import cross
 
 ROOT = 20_251_122
 # Two lane ends are side by side within these limits: along and across the road (metres) and in heading.
@@ -192,7 +192,7 @@ def _most_visible(
                 continue
             others = _places([sites[i] for i in waiting], away, setback, vector_map, config)
             for i, there, angle, free in zip(waiting.tolist(), *others, strict=True):
-                long_enough = line_length(sites[i][0].right) > away + _CLEAR
+                long_enough = line_lengths(sites[i][0].right) > away + _CLEAR
                 seen = visible(there, float(angle)) if free and long_enough else -1.0
                 if seen > best[i]:
                     place[i], heading[i], clear[i], best[i] = there, angle, True, seen
@@ -203,7 +203,7 @@ def _roadside(lane: LaneSegment, end: int, away: float) -> tuple[Float[np.ndarra
     """Return a point of a lane's right boundary, `away` metres from its end (-1) or its start (0), and the heading."""
     if away > 0.0:
         line = lane.right if end == 0 else lane.right[::-1]
-        along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line[:, :2], axis=0), axis=-1))])
+        along = arc_length(line)
         point, after = (np.array([np.interp(s, along, line[:, k]) for k in range(3)]) for s in (away, away + 1.0))
         step = after - point if end == 0 else point - after
         if np.hypot(step[0], step[1]) > 0.0:

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float
 
+from tflane_jax.geometry import line_lengths, without_repeats
 from tflane_jax.scene.logs import LaneSegment, Side, VectorMap
-from tflane_jax.world.roads.curves import line_length
 
 # Lanes shorter than this carry no traffic, metres.
 _SHORTEST = 0.5
@@ -52,7 +52,7 @@ def driving_side(found: VectorMap) -> Side | None:
     streets alone, it is what the source of the map tells; None where that is nothing.
     """
     lanes = [lane for lane in found.segments.values() if not lane.is_intersection and lane.vehicle]
-    lines = [lane.centerline[:, :2] for lane in lanes if line_length(lane.centerline) >= _SHORTEST]
+    lines = [lane.centerline[:, :2] for lane in lanes if line_lengths(lane.centerline) >= _SHORTEST]
     if not lines:
         return found.side
     at, ahead = (np.concatenate(parts) for parts in zip(*map(_directed, lines), strict=True))
@@ -83,7 +83,7 @@ def traffic_lanes(segments: dict[int, LaneSegment]) -> dict[int, LaneSegment]:
     A lane has the id of its first segment, and keeps only its centerline: `left` and `right` are the same line. Motor
     vehicles do not turn into bike lanes. Traffic decides at starts of lanes, so there should be no more than needed.
     """
-    usable = {i: s for i, s in segments.items() if line_length(s.centerline) >= _SHORTEST}
+    usable = {i: s for i, s in segments.items() if line_lengths(s.centerline) >= _SHORTEST}
     onward = {
         i: tuple(j for j in s.successors if j in usable and (usable[j].vehicle or not s.vehicle))
         for i, s in usable.items()
@@ -127,6 +127,4 @@ def traffic_lanes(segments: dict[int, LaneSegment]) -> dict[int, LaneSegment]:
 
 def _joined(lines: list[Float[np.ndarray, "_ 2"]]) -> Float[np.ndarray, "n 3"]:
     """Return lines in succession on the plane z = 0, without points that repeat the one before."""
-    points = np.concatenate(lines)
-    apart = np.linalg.norm(np.diff(points, axis=0), axis=-1) > 1e-3
-    return np.pad(points[np.concatenate([[True], apart])], ((0, 0), (0, 1)))
+    return np.pad(without_repeats(np.concatenate(lines), 1e-3), ((0, 0), (0, 1)))

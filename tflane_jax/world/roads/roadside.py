@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool, Float
 
+from tflane_jax.geometry import without_repeats
 from tflane_jax.world.roads.config import Range
 from tflane_jax.world.roads.curves import arc_length, direction, offset_polyline, points_at, right_of
 from tflane_jax.world.roads.site import Site
@@ -17,16 +18,13 @@ _CLEAR_BEFORE_STOP, _CLEAR_AFTER_JUNCTION, _CLEAR_OF_CROSSING = 14.0, 8.0, 7.0
 _SLOT = 6.5
 # Distance of buildings from every kerb, those around a corner included, metres.
 _BUILDING_CLEARANCE = 3.2
+# Points of a kerb this near to the one before are left out: their direction is rounding, metres.
+_SAME_POINT = 0.05
 
 
 def sidewalks(kerbs: Sequence[Float[np.ndarray, "n 2"]], behind: float) -> list[Float[np.ndarray, "n 2"]]:
     """Return the lines on which pedestrians walk, `behind` metres to the right of the kerbs."""
-    return [offset_polyline(_without_repeats(kerb), behind) for kerb in kerbs]
-
-
-def _without_repeats(line: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-    step = np.linalg.norm(np.diff(line, axis=0), axis=-1)
-    return line[np.concatenate([[True], step > 0.05])]
+    return [offset_polyline(without_repeats(kerb, _SAME_POINT), behind) for kerb in kerbs]
 
 
 def parking_slots(site: Site) -> Float[np.ndarray, "p 3"]:
@@ -86,7 +84,7 @@ def _plots(
     rng: np.random.Generator, kerb: Float[np.ndarray, "n 2"], setback: Range, density: float
 ) -> Float[np.ndarray, "b 5"]:
     """Return boxes in a row along a kerb, fronts parallel to it."""
-    line = _without_repeats(kerb)
+    line = without_repeats(kerb, _SAME_POINT)
     total = arc_length(line)[-1]
     count = int(total / 14.0) + 1
     length, depth = rng.uniform(9.0, 24.0, count), rng.uniform(8.0, 16.0, count)

@@ -22,6 +22,7 @@ from tflane_jax.geometry import (
     invert_pose,
     nearest_lines,
     resample_lines,
+    simplify,
     transform_points,
 )
 from tflane_jax.geometry.poses import yaw_pose
@@ -139,37 +140,6 @@ def pack_lines(
     sd_map.category[:n] = np.array([label for _, label in pieces])[kept]
     sd_map.valid[:n] = True
     return sd_map, len(pieces) - n
-
-
-def simplify(points: Float[np.ndarray, "n 2"], tolerance: float) -> Float[np.ndarray, "k 2"]:
-    """Return the vertices of a line that keep all others within `tolerance` metres (Douglas and Peucker 1973).
-
-    Both ends stay; 0 keeps every vertex. A closed line is cut at the vertex farthest from its seam.
-    """
-    if tolerance <= 0.0 or len(points) < 3:
-        return points
-    keep = np.zeros(len(points), bool)
-    keep[[0, -1]] = True
-    spans = [(0, len(points) - 1)]
-    while spans:
-        first, last = spans.pop()
-        if last - first < 2:
-            continue
-        distance = _distance(points[first + 1 : last], points[first], points[last])
-        farthest = first + 1 + int(np.argmax(distance))
-        if distance[farthest - first - 1] > tolerance:
-            keep[farthest] = True
-            spans += [(first, farthest), (farthest, last)]
-    return points[keep]
-
-
-def _distance(
-    points: Float[np.ndarray, "n 2"], start: Float[np.ndarray, "2"], stop: Float[np.ndarray, "2"]
-) -> Float[np.ndarray, " n"]:
-    """Return the distances of points from the segment between two others."""
-    along = stop - start
-    fraction = np.clip((points - start) @ along / max(float(along @ along), 1e-12), 0.0, 1.0)
-    return np.linalg.norm(points - start - fraction[:, None] * along, axis=-1)
 
 
 def crossing_line(ring: Float[np.ndarray, "5 2"]) -> Float[np.ndarray, "2 2"]:

@@ -191,8 +191,8 @@ def draw_camera(
     elif not predicted:
         draw_projected(ax, views, number, np.asarray(example.lanes.points)[np.asarray(example.lanes.valid)])
     if number == 0 and elements is not None:
-        score = 1.0 / (1.0 + np.exp(-np.asarray(elements.logits, np.float64)))
-        draw_boxes(ax, np.asarray(elements.box), score.argmax(-1), score.max(-1) >= threshold)
+        attribute, shown = np.asarray(elements.logits).argmax(-1), np.asarray(elements.scores) >= threshold
+        draw_boxes(ax, np.asarray(elements.box), attribute, shown)
     elif number == 0 and not predicted and example.traffic_elements is not None:
         truth: TrafficElements = example.traffic_elements
         draw_boxes(ax, np.asarray(truth.box), np.asarray(truth.attribute), np.asarray(truth.valid))

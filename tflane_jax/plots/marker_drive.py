@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.special import expit
 
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.geometry.cameras import project
@@ -80,15 +79,16 @@ def save_drive_frame(
         threshold: lowest score of predicted lanes.
     """
     shown = _cameras(views, detected)
+    found = None
+    if prediction is not None:
+        found = np.asarray(prediction.points)[np.asarray(prediction.scores) >= threshold]
     figure, axes = new_figure(1, len(shown) + 1, panel=(4.4, 3.6), footer=0.3)
     for number, ax in zip(shown, axes[0], strict=False):
         name = names[number] if names else f"camera {number}"
         draw_boards(ax, views, number, detected, outcomes, confidence, guidance, title=name)
-        if prediction is not None and hasattr(prediction, "scores"):
-            found = np.asarray(prediction.points)[np.asarray(prediction.scores) >= threshold]
-            if found.shape[-1] == 3:
-                small = _at_scale(views, _factor(views, number))
-                draw_projected(ax, small, number, found, colour=style.PREDICTION, width=0.9)
+        if found is not None and found.shape[-1] == 3:
+            small = _at_scale(views, _factor(views, number))
+            draw_projected(ax, small, number, found, colour=style.PREDICTION, width=0.9)
     above: Any = axes[0, -1]
     prepare(above, view, title)
     above.set_xlabel("x, forward [m]", fontsize=8)
@@ -97,11 +97,8 @@ def save_drive_frame(
     if prediction is not None:
         draw_prediction(above, prediction, threshold=threshold)
     drawn = [np.zeros((1, 2)), *(line[:, :2] for line in _lanes(guidance)[0])]  # the ego vehicle, and lanes
-    if prediction is not None:
-        drawn += [
-            line[:, :2]
-            for line in np.asarray(prediction.points)[expit(np.asarray(prediction.logits)).max(-1) >= threshold]
-        ]
+    if found is not None:
+        drawn += [line[:, :2] for line in found]
     for k in np.flatnonzero(detected.valid).tolist():
         number = int(detected.marker_id[k])
         x, y = detected.pose[k, :2, 3].tolist()

@@ -13,6 +13,11 @@ from tflane_jax.errors import UserError
 from tflane_jax.scene.arrays import Array
 
 
+def best_confidence(logits: Float[Array, "*b c"]) -> Float[Array, "*b"]:
+    """Return the confidence of the best class, 0 to 1: of independent classes, so each has its own sigmoid."""
+    return jax.nn.sigmoid(logits).max(-1)
+
+
 @struct.dataclass
 class CenterlinePrediction:
     """Centerlines predicted by Q queries.
@@ -30,7 +35,7 @@ class CenterlinePrediction:
     @property
     def scores(self) -> Float[Array, "*layers q"]:
         """Confidence of the best class, 0 to 1."""
-        return jax.nn.sigmoid(self.logits).max(-1)
+        return best_confidence(self.logits)
 
 
 @struct.dataclass
@@ -48,7 +53,7 @@ class AreaPrediction:
     @property
     def scores(self) -> Float[Array, "*layers q"]:
         """Confidence of the best class, 0 to 1."""
-        return jax.nn.sigmoid(self.logits).max(-1)
+        return best_confidence(self.logits)
 
 
 @struct.dataclass
@@ -78,7 +83,7 @@ class SegmentPrediction:
     @property
     def scores(self) -> Float[Array, "*layers q"]:
         """Confidence of the best class, 0 to 1."""
-        return jax.nn.sigmoid(self.logits).max(-1)
+        return best_confidence(self.logits)
 
 
 @struct.dataclass
@@ -96,7 +101,7 @@ class LinePrediction:
     @property
     def scores(self) -> Float[Array, "*layers q"]:
         """Confidence of the best class, 0 to 1."""
-        return jax.nn.sigmoid(self.logits).max(-1)
+        return best_confidence(self.logits)
 
 
 @struct.dataclass
@@ -116,7 +121,7 @@ class ElementPrediction:
     @property
     def scores(self) -> Float[Array, "*layers e"]:
         """Confidence of the best attribute, 0 to 1."""
-        return jax.nn.sigmoid(self.logits).max(-1)
+        return best_confidence(self.logits)
 
 
 @struct.dataclass

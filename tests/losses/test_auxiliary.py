@@ -7,7 +7,9 @@ import pytest
 
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.losses.auxiliary import auxiliary_losses, denoising_pairs
+from tflane_jax.losses.common import declared_outputs
 from tflane_jax.losses.lane_weights import LaneWeights
+from tflane_jax.losses.maptr import MapTrLossConfig
 from tflane_jax.models.auxiliary import AuxiliaryOutputs, LaneProposalOutputs
 from tflane_jax.scene import CenterlinePrediction, LaneGraph
 
@@ -61,3 +63,19 @@ def test_an_output_that_is_missing_and_one_without_a_loss_are_two_faults(outputs
     settings = {"weights": LaneWeights(), "bev_range": PerceptionRange(), "denoising": lambda *_: {}}
     with pytest.raises(ValueError, match=message):
         auxiliary_losses(outputs, (name,), truth, **settings)
+    if outputs.line_mask is not None:
+        with pytest.raises(ValueError, match=f"{message} to auxiliary_terms"):
+            MapTrLossConfig().auxiliary_terms(name, outputs.line_mask, truth, truth, None)
+
+
+def test_declared_outputs_come_in_the_order_of_the_host():
+    outputs = AuxiliaryOutputs(line_mask=jnp.zeros(1), lane_cells=jnp.ones(2))
+    for names in (("line_mask", "lane_cells"), ("lane_cells", "line_mask"), ()):
+        found = list(declared_outputs(outputs, names))
+        assert [name for name, _ in found] == list(names)
+        assert all(value is getattr(outputs, name) for name, value in found)
+    # What comes before a missing one is computed first.
+    rest = declared_outputs(outputs, ("lane_cells", "denoised"))
+    assert next(rest)[0] == "lane_cells"
+    with pytest.raises(ValueError, match="denoised, but it is missing: sow it in the model"):
+        next(rest)

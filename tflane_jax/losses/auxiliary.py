@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from tflane_jax.geometry import PerceptionRange
-from tflane_jax.losses.common import Report, Terms, last_layer
+from tflane_jax.losses.common import Report, Terms, declared_outputs, last_layer, without_loss
 from tflane_jax.losses.lane_cells import lane_cell_loss, used_lanes
 from tflane_jax.losses.lane_proposals import lane_proposal_sums
 from tflane_jax.losses.lane_weights import LaneWeights
@@ -48,9 +48,7 @@ def auxiliary_losses(
         ValueError: a declared auxiliary output is missing, or has no loss here.
     """
     losses, report = [], {}
-    for name in names:
-        if (output := getattr(outputs, name)) is None:
-            raise ValueError(f"the host declares the auxiliary output {name}, but it is missing: sow it in the model")
+    for name, output in declared_outputs(outputs, names):
         if name == "denoised":
             terms = denoising(output, lanes)
             losses.append(sum(term.sum() for term in terms.values()))
@@ -69,7 +67,7 @@ def auxiliary_losses(
             report |= {"proposal_heat": heat, "proposal_points": shapes}
             losses += [heat, shapes]
         else:
-            raise ValueError(f"the auxiliary output {name} has no loss: add a branch to auxiliary_losses")
+            raise without_loss(name, "auxiliary_losses")
     return losses, report
 
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +16,8 @@ from tflane_jax.errors import UserError
 from tflane_jax.matching import Assignment
 from tflane_jax.models.auxiliary import AuxiliaryOutputs
 from tflane_jax.scene import Example, Prediction
+
+NameT = TypeVar("NameT", bound=str)
 
 Terms = dict[str, Float[Array, " layers"]]
 """Weighted loss terms by name, one value for each decoder layer."""
@@ -65,6 +68,23 @@ def checked_loss(losses: HostLossConfig, found: Any) -> tuple[Float[Array, ""], 
         if value is loss and not jnp.issubdtype(kind, jnp.floating):
             raise UserError(f"{what}: {name} is of type {kind}, expected a float")
     return loss, report
+
+
+def declared_outputs(outputs: AuxiliaryOutputs, names: Iterable[NameT]) -> Iterator[tuple[NameT, Any]]:
+    """Yield name and value of the auxiliary outputs that a host declares, in the order of `names`.
+
+    Raises:
+        ValueError: one of them is missing.
+    """
+    for name in names:
+        if (output := getattr(outputs, name)) is None:
+            raise ValueError(f"the host declares the auxiliary output {name}, but it is missing: sow it in the model")
+        yield name, output
+
+
+def without_loss(name: str, function: str) -> ValueError:
+    """Return the error that a function of losses has none for an auxiliary output."""
+    return ValueError(f"the auxiliary output {name} has no loss: add a branch to {function}")
 
 
 def total(terms: Terms) -> Float[Array, ""]:

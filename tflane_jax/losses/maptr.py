@@ -27,10 +27,12 @@ from tflane_jax.losses.common import (
     Report,
     Terms,
     class_losses,
+    declared_outputs,
     last_layer,
     matched,
     positives,
     total,
+    without_loss,
 )
 from tflane_jax.losses.costs import focal_cost, pairwise_l1
 from tflane_jax.matching import Assignment, match
@@ -81,11 +83,7 @@ class MapTrLossConfig(HostLossConfig):
         coordinates, classes = outputs.lines.points.shape[-1], outputs.lines.logits.shape[-1]
         targets = jax.vmap(partial(line_targets, coordinates=coordinates, classes=classes, rings=self.rings))(lines)
         loss, report = line_loss(outputs.lines, targets, range_, self)
-        for name in host.auxiliary:
-            if (output := getattr(auxiliary, name)) is None:
-                raise ValueError(
-                    f"the host declares the auxiliary output {name}, but it is missing: sow it in the model"
-                )
+        for name, output in declared_outputs(auxiliary, host.auxiliary):
             terms = self.auxiliary_terms(name, output, targets, batch, host)
             loss, report = loss + total(terms), report | last_layer(terms)
         return loss, report
@@ -103,7 +101,7 @@ class MapTrLossConfig(HostLossConfig):
             ValueError: the output has no loss here.
         """
         if name != "denoised":
-            raise ValueError(f"the auxiliary output {name} has no loss: add a branch to auxiliary_terms")
+            raise without_loss(name, "auxiliary_terms")
         terms = line_denoising_losses(output, targets, host.bev_range, self)
         return {f"denoised_{key}": value for key, value in terms.items()}
 

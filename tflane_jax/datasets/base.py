@@ -164,6 +164,13 @@ def made(dataset: IndexedExamples, index: int) -> Any:
         raise
 
 
+def checked_index(index: int, size: int, name: str, what: str = "examples") -> int:
+    """Return the index of an example; raise IndexError where the dataset `name` of that size has none."""
+    if not 0 <= index < size:
+        raise IndexError(f"{name} has {size} {what}, no number {index}")
+    return index
+
+
 def spread(size: int, count: int) -> list[int]:
     """Return `count` indices spread evenly over `size` (all of them if there are fewer); none for less than one."""
     return np.unique(np.linspace(0, size - 1, min(max(count, 0), size)).round().astype(int)).tolist()

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, Generic, Literal, Protocol, TypeVar, cast
 
-from tflane_jax.datasets.base import ExampleConfig, Split
+from tflane_jax.datasets.base import Dataset, ExampleConfig, Split
 from tflane_jax.datasets.loading import load_or_stream
 from tflane_jax.datasets.overlap import DrivenPath
 from tflane_jax.datasets.streaming import StreamingConfig
@@ -140,6 +140,20 @@ class DataSource(Generic[ConfigT]):
     tracks_hz: Callable[[ConfigT], float | None] = lambda config: None
     content: Callable[[ConfigT], str] = lambda config: ""
     unlabelled: Callable[[ConfigT], str] = lambda config: ""
+
+
+def first_or_nominal(dataset: Callable[[Any], Dataset], nominal: Callable[[Any], Example]) -> Callable[[Any], Example]:
+    """Return `DataSource.sample` of data in a folder: the first example, or without the folder a nominal one.
+
+    Args:
+        dataset: opens a config, which names its folder `root`.
+        nominal: config -> an example with the same shapes, made without files.
+    """
+
+    def sample(config: Any) -> Example:
+        return dataset(config).example(0) if Path(config.root).is_dir() else nominal(config)
+
+    return sample
 
 
 def split_config(config: type[ConfigT], data: Any, **own: Any) -> ConfigT:

@@ -13,7 +13,7 @@ import jax
 import numpy as np
 
 from tflane_jax.datasets.augmentation import AugmentationConfig
-from tflane_jax.datasets.base import FrameInfo, Split
+from tflane_jax.datasets.base import FrameInfo, Split, checked_index
 from tflane_jax.datasets.cache import cached
 from tflane_jax.datasets.data_source import Choice, DataSource
 from tflane_jax.datasets.lane_rows import LabelledImages, row_lanes
@@ -83,8 +83,7 @@ class FrontViewDataset:
 
     def scene_id(self, index: int) -> int:
         """Return the world's number of one image; raises IndexError outside the dataset."""
-        if not 0 <= index < len(self):
-            raise IndexError(f"{self.name} has {len(self)} images, no number {index}")
+        checked_index(index, len(self), self.name, "images")
         return FIRST_SCENE[self.config.split] + self.config.first + index
 
 

@@ -19,8 +19,8 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from tflane_jax.datasets.base import ExampleConfig, FrameInfo, Split
-from tflane_jax.datasets.data_source import Choice, DataSource, split_config
+from tflane_jax.datasets.base import ExampleConfig, FrameInfo, Split, checked_index
+from tflane_jax.datasets.data_source import Choice, DataSource, first_or_nominal, split_config
 from tflane_jax.datasets.examples import make_example
 from tflane_jax.datasets.log_frames import KEPT_LOGS
 from tflane_jax.datasets.nuscenes_cameras import (
@@ -224,9 +224,7 @@ class NuScenesDataset:
         return camera_fits(self.tables, self.config.image)
 
     def _place(self, index: int) -> tuple[str, int]:
-        if not 0 <= index < len(self):
-            raise IndexError(f"{self.name} has {len(self)} examples, no number {index}")
-        return self._places[index]
+        return self._places[checked_index(index, len(self), self.name)]
 
 
 def _reach(config: ExampleConfig) -> float:
@@ -300,10 +298,6 @@ def _content(config: NuScenesConfig) -> str:
     return hashlib.sha256(json.dumps(names).encode()).hexdigest()
 
 
-def _sample(config: NuScenesConfig) -> Example:
-    return NuScenesDataset(config).example(0) if Path(config.root).is_dir() else nominal_example(config)
-
-
 SOURCE = DataSource(
     name="nuscenes",
     data=NuScenesData,
@@ -311,7 +305,7 @@ SOURCE = DataSource(
     example=Example,
     dataset=NuScenesDataset,
     streams=lambda config: config.image is not None,
-    sample=_sample,
+    sample=first_or_nominal(NuScenesDataset, nominal_example),
     choose=_choose,
     title=lambda config: f"nuscenes-{config.split}",
     drives=lambda config: frame_drives(NuScenesDataset(config)),

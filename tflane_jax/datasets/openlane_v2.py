@@ -16,8 +16,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from tflane_jax.datasets.base import FrameInfo, Split
-from tflane_jax.datasets.data_source import Choice, DataSource, FolderCheck, split_config
+from tflane_jax.datasets.base import FrameInfo, Split, checked_index
+from tflane_jax.datasets.data_source import Choice, DataSource, FolderCheck, first_or_nominal, split_config
 from tflane_jax.datasets.openlane_annotation import read_annotation
 from tflane_jax.datasets.openlane_can_bus import vehicle_state
 from tflane_jax.datasets.openlane_check import check_openlane_v2
@@ -91,7 +91,8 @@ class OpenLaneV2Dataset:
 
     def example(self, index: int) -> Example:
         """Return one frame."""
-        config, key, files = self.config.example, self.keys[self._checked(index)], self._files(index)
+        key = self.keys[checked_index(index, len(self), self.name)]
+        config, files = self.config.example, self._files(index)
         if (bare := [file.path for file in files if file.annotation is None]) and key.split != "test":
             raise UserError(f"{bare[0]} has no annotation: of the splits, only test may have such frames")
         annotations = [
@@ -137,13 +138,13 @@ class OpenLaneV2Dataset:
 
     def info(self, index: int) -> FrameInfo:
         """Return segment, time and pose of one frame, and its city, which only the source logs tell."""
-        key = self.keys[self._checked(index)]
+        key = self.keys[checked_index(index, len(self), self.name)]
         area = "" if self._tracks is None else self._tracks.area(key)
         return FrameInfo("openlane_v2", key.scene, self._time(index), self._pose(index), area)
 
     def scene(self, index: int) -> str:
         """Return the segment of one frame; reads no file."""
-        return self.keys[self._checked(index)].scene
+        return self.keys[checked_index(index, len(self), self.name)].scene
 
     def in_files(self, boxes: Float[np.ndarray, "e 2 2"]) -> Float[np.ndarray, "e 2 2"]:
         """Return boxes of examples, of the front camera, in pixels of its files."""
@@ -161,11 +162,6 @@ class OpenLaneV2Dataset:
     @property
     def _suffixes(self) -> list[str]:
         return [names.suffix for names in self._names]
-
-    def _checked(self, index: int) -> int:
-        if not 0 <= index < len(self):
-            raise IndexError(f"{self.name} has {len(self)} examples, no number {index}")
-        return index
 
     def _files(self, index: int) -> list[FrameFile]:
         files = [read_frame(self.root, self.keys[index], self.config.subset, suffix) for suffix in self._suffixes]
@@ -267,10 +263,6 @@ class OpenLaneV2Data(OpenLaneV2Settings):
         return split_config(OpenLaneV2Config, self, split=getattr(self, split), map_changes=map_changes)
 
 
-def _sample(config: OpenLaneV2Config) -> Example:
-    return OpenLaneV2Dataset(config).example(0) if Path(config.root).is_dir() else nominal_example(config)
-
-
 def _choose(choice: Choice) -> OpenLaneV2Config:
     assert choice.root is not None
     if isinstance(choice.configured, OpenLaneV2Config):  # its splits stay as configured: the official test has no truth
@@ -301,7 +293,7 @@ SOURCE = DataSource(
     example=Example,
     dataset=OpenLaneV2Dataset,
     streams=lambda config: True,
-    sample=_sample,
+    sample=first_or_nominal(OpenLaneV2Dataset, nominal_example),
     choose=_choose,
     title=lambda config: f"openlane-v2-{config.subset}-{config.split}",
     drives=lambda config: frame_drives(OpenLaneV2Dataset(config)),

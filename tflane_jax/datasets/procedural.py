@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
-from tflane_jax.datasets.base import ExampleConfig, FrameInfo, Split
+from tflane_jax.datasets.base import ExampleConfig, FrameInfo, Split, checked_index
 from tflane_jax.datasets.cache import CachedDataset, cached
 from tflane_jax.datasets.data_source import Choice, DataSource
 from tflane_jax.datasets.examples import make_example
@@ -97,8 +97,7 @@ class SimulatedDataset:
 
     def scene_id(self, index: int) -> int:
         """Return the world's scene number of one example; raises IndexError outside the dataset."""
-        if not 0 <= index < len(self):
-            raise IndexError(f"{self.name} has {len(self)} examples, no number {index}")
+        checked_index(index, len(self), self.name)
         return FIRST_SCENE[self.config.split] + self.config.first + index // self.config.world.keyframes
 
     def simulated(self, scene_id: int) -> Log:

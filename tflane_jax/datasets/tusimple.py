@@ -21,7 +21,7 @@ import numpy as np
 
 from tflane_jax.cores import working_cores
 from tflane_jax.datasets.augmentation import AugmentationConfig
-from tflane_jax.datasets.base import SPLITS, FrameInfo, Split
+from tflane_jax.datasets.base import SPLITS, FrameInfo, Split, checked_index
 from tflane_jax.datasets.data_source import Choice, DataSource, FolderCheck, loading_of
 from tflane_jax.datasets.lane_rows import LabelledImages, lane_lines
 from tflane_jax.datasets.loading import IN_MEMORY
@@ -117,7 +117,7 @@ class TuSimpleDataset:
 
     def example(self, index: int) -> RoadImage:
         """Return one frame; raises UserError where its image cannot be read."""
-        name, truth, folder = self._labels[self._checked(index)]
+        name, truth, folder = self._labels[checked_index(index, len(self), self.name)]
         image = read_image(folder / name)
         height, width = self._sizes[name] = image.shape[:2]
         image = resize(image, self.config.height, self.config.width)
@@ -129,23 +129,18 @@ class TuSimpleDataset:
 
         Reads the image for its size if `example` has not; raises UserError where it cannot be read.
         """
-        name, truth, folder = self._labels[self._checked(index)]
+        name, truth, folder = self._labels[checked_index(index, len(self), self.name)]
         if name not in self._sizes:
             self._sizes[name] = read_image(folder / name).shape[:2]
         return replace(truth, size=self._sizes[name])
 
     def raw_file(self, index: int) -> str:
         """Return the name that label and prediction files give a frame."""
-        return self._labels[self._checked(index)][0]
+        return self._labels[checked_index(index, len(self), self.name)][0]
 
     def info(self, index: int) -> FrameInfo:
         """Return where one frame comes from; TuSimple gives neither time nor pose."""
         return FrameInfo("tusimple", self.raw_file(index), 0, np.eye(4))
-
-    def _checked(self, index: int) -> int:
-        if not 0 <= index < len(self):
-            raise IndexError(f"{self.name} has {len(self)} examples, no number {index}")
-        return index
 
 
 def load_road_images(dataset: TuSimpleDataset, *, progress: bool = True, workers: int | None = None) -> RoadImage:

@@ -36,7 +36,7 @@ def trained(tmp_path_factory, config):
 def test_help_imports_nothing_slow():
     code = "import sys; from tflane_jax.cli import build_parser; build_parser().format_help(); print(*sys.modules)"
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT).stdout
-    assert not {"jax", "numpy", "flax", "tyro", "matplotlib"} & set(loaded.split())
+    assert not {"jax", "numpy", "flax", "tyro", "matplotlib", "tqdm"} & set(loaded.split())
 
 
 def test_the_package_runs_as_the_program_does():

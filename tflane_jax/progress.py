@@ -1,6 +1,7 @@
 """Progress of long work with its rate and the time left: a bar where lines can be updated, elsewhere a line at times.
 
 A log file keeps every state of a bar that is drawn into it; `progress_bar` writes whole lines there, few of them.
+tqdm is imported in functions: the command line imports this file before it knows whether there is progress to show.
 """
 
 from __future__ import annotations
@@ -8,9 +9,10 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Iterable, Iterator
-from typing import Any, Generic, TypeVar, cast
+from typing import TYPE_CHECKING, Any, Generic, TypeVar, cast
 
-from tqdm import tqdm
+if TYPE_CHECKING:
+    from tqdm import tqdm
 
 T = TypeVar("T")
 # Between two lines in a log.
@@ -40,8 +42,17 @@ def progress_bar(
     """
     # In a notebook, standard error is no terminal, but its lines are updated.
     if disable or sys.stderr.isatty() or "ipykernel" in sys.modules:
+        from tqdm import tqdm
+
         return cast("tqdm[T]", tqdm(items, desc, total, unit=unit, initial=initial, disable=disable))
     return ProgressLines(items, desc, unit, total, initial)
+
+
+def write(text: str) -> None:
+    """Print a line on standard error, above progress bars."""
+    from tqdm import tqdm
+
+    tqdm.write(text, file=sys.stderr)
 
 
 class ProgressLines(Generic[T]):
@@ -99,6 +110,8 @@ class ProgressLines(Generic[T]):
 
     def _write(self, rate: float | None) -> None:
         """Write a line; with a rate of None, it is the mean since the beginning."""
+        from tqdm import tqdm
+
         self._written = time.monotonic()
         line = tqdm.format_meter(
             self.n,

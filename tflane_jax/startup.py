@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator
 from contextvars import ContextVar
 from typing import Any, TypeVar
 
-from tqdm import tqdm
+from tflane_jax.progress import write
 
 T = TypeVar("T")
 _REFRESH_SECONDS = 0.5
@@ -90,14 +90,11 @@ def ready() -> None:
         display.ready()
 
 
-def write(text: str) -> None:
-    """Print a line on standard error, above progress bars."""
-    tqdm.write(text, file=sys.stderr)
-
-
 @contextlib.contextmanager
 def _updated_line(name: str) -> Iterator[None]:
     """Show a line with the seconds since it began, which vanishes at the end of the block."""
+    from tqdm import tqdm
+
     ended = threading.Event()
     with tqdm(desc=name, bar_format="{desc} ({elapsed})", leave=False) as line:
 

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from tflane_jax.errors import UserError
 from tflane_jax.files.locks import take
-from tflane_jax.startup import write
+from tflane_jax.progress import write
 
 
 def cores_each(parallel: int, cores: int | None = None) -> int:

@@ -27,10 +27,10 @@ from tflane_jax.config_io import first_difference
 from tflane_jax.errors import Interrupted, UserError
 from tflane_jax.files.wording import counted
 from tflane_jax.memory import give_back_freed_memory, huge_pages_for_children, keep_freed_memory
-from tflane_jax.progress import progress_bar
+from tflane_jax.progress import progress_bar, write
 from tflane_jax.run_checks import check_run
 from tflane_jax.runs import build_data, train_run
-from tflane_jax.startup import leave, showing, write
+from tflane_jax.startup import leave, showing
 from tflane_jax.training.array_files import first_line
 from tflane_jax.training.provenance import thread_setting
 from tflane_jax.training.runtime import configure_jax

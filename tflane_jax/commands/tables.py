@@ -18,7 +18,7 @@ from tflane_jax.ablations.tables import TABLES, find_table
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import check_folder
 from tflane_jax.plots.tables import format_table
-from tflane_jax.startup import write
+from tflane_jax.progress import write
 from tflane_jax.training.run_folder import is_locked
 from tflane_jax.training.runtime import configure_jax
 

@@ -23,8 +23,8 @@ from tflane_jax.errors import UserError
 from tflane_jax.files.wording import counted
 from tflane_jax.own_modules import imports_of
 from tflane_jax.plots.tables import format_table
+from tflane_jax.progress import write
 from tflane_jax.runs import resumable_config, train_run
-from tflane_jax.startup import write
 from tflane_jax.training.runtime import configure_jax
 
 _NOT_BEGUN = " before the run began: give the same command again"

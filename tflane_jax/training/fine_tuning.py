@@ -15,7 +15,7 @@ from flax.traverse_util import unflatten_dict
 from tflane_jax.errors import UserError
 from tflane_jax.migrations import migrate, value_at
 from tflane_jax.models.parameters import Params
-from tflane_jax.startup import write
+from tflane_jax.progress import write
 from tflane_jax.training.array_files import flat
 from tflane_jax.training.checkpoint import Checkpoints
 from tflane_jax.training.run_folder import read_config

@@ -11,7 +11,7 @@ import jax
 import numpy as np
 
 from tflane_jax.errors import UserError
-from tflane_jax.startup import write
+from tflane_jax.progress import write
 from tflane_jax.training.records import Record
 from tflane_jax.training.restarts import RestartsConfig
 

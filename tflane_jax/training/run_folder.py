@@ -26,7 +26,7 @@ from tflane_jax.files.fields import load_json
 from tflane_jax.files.locks import take
 from tflane_jax.migrations import value_at
 from tflane_jax.processes import agreed, from_first
-from tflane_jax.startup import write
+from tflane_jax.progress import write
 from tflane_jax.training.checkpoint import Checkpoints
 from tflane_jax.training.provenance import add_provenance
 

@@ -15,7 +15,7 @@ from tflane_jax import accelerators
 from tflane_jax.datasets.cache import cache_root
 from tflane_jax.errors import UserError
 from tflane_jax.memory import keep_freed_memory
-from tflane_jax.startup import write
+from tflane_jax.progress import write
 
 _UNREADABLE = "Error reading persistent compilation cache entry"  # the beginning of a warning of JAX's
 _PROGRAMS = 2 * 2**30  # bytes of kept programs

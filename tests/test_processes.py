@@ -173,7 +173,7 @@ def test_all_processes_have_the_same_examples(tmp_path):
 
 @pytest.mark.slow
 def test_one_that_is_stopped_alone_ends_the_others(tmp_path):
-    """Regression: they waited for it, and it for them, for five minutes."""
+    """Regression: they waited for it, and it for them, for five minutes; later JAX took the signal and did nothing."""
     (first, *_), (second, *_) = ended(begun(tmp_path / "run", ["new", "early"]))
     assert second == 128 + signal.SIGTERM
     assert first != 0

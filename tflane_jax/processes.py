@@ -50,6 +50,9 @@ def join(coordinator: str | None, processes: int | None, process: int | None) ->
     With explicit arguments, a process uses all devices that it sees; in a cluster's job, those of its task
     (`accelerators.devices_of_task`). JAX_LOCAL_DEVICE_IDS overrules both.
 
+    JAX's preemption service stays off: its handler of SIGTERM would replace that of the command, and nothing here asks
+    it whether a SIGTERM came.
+
     Args:
         coordinator: host:port of the first process. None, together with the others: JAX asks the cluster (Slurm, Open
             MPI, Kubernetes, Cloud TPU).
@@ -66,6 +69,7 @@ def join(coordinator: str | None, processes: int | None, process: int | None) ->
         raise UserError(f"--process {process} is none of {processes}: they are numbered from 0")
     ask = coordinator is None  # the cluster
     own = devices_of_task(os.environ) if ask and "JAX_LOCAL_DEVICE_IDS" not in os.environ else None
+    jax.config.update("jax_enable_preemption_service", False)
     try:
         jax.distributed.initialize(
             coordinator,

@@ -1,8 +1,8 @@
 """One of several processes that train the stub task: `python -m tests.training.many_processes FOLDER PORT N I START`.
 
 START "new", "resume", or "shared", which is new with a state that all share, as is "unpictured", which cannot draw;
-"early" stops this process before it begins, "stopped" sends it SIGTERM in its first evaluation, "killed" SIGKILL in
-its second one; "unreadable:STEP" cannot read the data of an update, "fewer" lacks one of the examples. It evaluates
+"early" sends this process SIGTERM while it reads its data, "stopped" in its first evaluation, "killed" SIGKILL in its
+second one; "unreadable:STEP" cannot read the data of an update, "fewer" lacks one of the examples. It evaluates
 with predictions, which all processes make together, and draws with predictions of its own.
 """
 
@@ -22,7 +22,8 @@ from tests.training.many_devices import EVENLY, Line
 from tests.training.stub import line_arrays
 from tests.training.stub_run import run
 from tflane_jax import processes
-from tflane_jax.errors import Interrupted, UserError
+from tflane_jax.cli import _ending_on_sigterm
+from tflane_jax.errors import UserError
 from tflane_jax.evaluation.predict import predicted_batches, predictions
 
 CONFIG = dataclasses.replace(EVENLY, seeds=(0,))
@@ -73,10 +74,10 @@ def main() -> None:
         config = dataclasses.replace(CONFIG, shard_state=start in ("shared", "unpictured"))
         others = {"evaluate": evaluate, "draw": None if start == "unpictured" else draw}
         with processes.leaving():
-            if start == "early":
-                processes.from_first(lambda: None)
-                raise Interrupted(signal.SIGTERM)
-            others["arrays"] = line_arrays(19 if start == "fewer" else 20)
+            with processes.agreed():
+                if start == "early":
+                    os.kill(os.getpid(), signal.SIGTERM)
+                others["arrays"] = line_arrays(19 if start == "fewer" else 20)
             result = run(Path(folder), start=begin, config=config, prepare=prepare, **others)
     except UserError as error:
         print(json.dumps({"error": str(error)}))
@@ -85,4 +86,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with _ending_on_sigterm():  # as the command line does, before it joins
+        main()

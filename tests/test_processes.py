@@ -203,6 +203,19 @@ def test_the_command_line_trains_on_two_processes(tmp_path):
 
 
 @pytest.mark.slow
+def test_processes_that_start_in_different_ways_are_refused(tmp_path):
+    """Regression: one gathered while the other broadcast, and both waited for ever."""
+    (tmp_path / "tiny.py").write_text(TINY)
+    train = ["-m", "tests.slow_start", "nothing", "train", "--out", str(tmp_path / "run"), "--coordinator"]
+    train += [f"localhost:{free_port()}", "--processes", "2", "--process"]
+    starts = ["--config", str(tmp_path / "tiny.py:baseline")], ["--resume"]
+    for code, _, errors in ended([[*train, str(i), *start] for i, start in enumerate(starts)]):
+        assert code == 2
+        assert "process 0 has --config, process 1 has --resume: give all processes the same command" in errors
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.slow
 def test_a_state_that_processes_share_gives_the_same_numbers(trained, tmp_path):
     folder = tmp_path / "run"
     assert [each["step"] for each in together(folder, ["shared", "shared"])] == [30, 30]
@@ -240,5 +253,6 @@ def test_outside_of_a_cluster_the_options_are_named(monkeypatch):
 def test_a_process_on_its_own_is_the_first():
     assert (processes.process_count(), processes.is_first()) == (1, True)
     assert processes.from_first(lambda: {"a": [1, None]}) == {"a": [1, None]}
+    assert processes.all_texts("é") == ["é"]
     assert processes.stop_signal(15, 3) == 15
     assert processes.stop_signal(None, 3) is None

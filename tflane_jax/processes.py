@@ -209,6 +209,20 @@ def arrays_from_first(make: Callable[[], T], like: T) -> T:
     return _broadcast(held)
 
 
+def all_texts(text: str) -> list[str]:
+    """Return the texts of all processes, in process order."""
+    if process_count() == 1:
+        return [text]
+    from jax.experimental import multihost_utils
+
+    own = np.frombuffer(text.encode(), np.uint8)
+    sizes = np.asarray(multihost_utils.process_allgather(np.int32(len(own))))
+    padded = np.zeros(sizes.max(), np.uint8)
+    padded[: len(own)] = own
+    every = np.asarray(multihost_utils.process_allgather(padded))
+    return [row[:size].tobytes().decode() for row, size in zip(every, sizes, strict=True)]
+
+
 def all_rows(tree: Any) -> Any:
     """Return arrays (numpy) whose rows (leading axis) are divided among the processes as whole ones, in process order.
 

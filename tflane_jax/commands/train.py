@@ -47,6 +47,7 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> int:
 
 
 def _trained(options: argparse.Namespace, overrides: Sequence[str]) -> int:
+    _agree_on_start(options)
     out = options.out or _default_folder(options.config)
     config = _config(options, out, overrides)
     _print_devices()
@@ -78,6 +79,20 @@ def _trained(options: argparse.Namespace, overrides: Sequence[str]) -> int:
         print(f"pictures: {', '.join(pictures)}")
     print(f"evaluate with: tflane eval {shlex.quote(str(out))}{own}")
     return 0
+
+
+def _agree_on_start(options: argparse.Namespace) -> None:
+    """Raise UserError, in all processes, where one starts in another way than the first.
+
+    From then on, their ways of starting let processes wait for different things of one another, which would never come.
+    """
+    own = ["--config"] * (options.config is not None) + [f"--{options.start}"] * (options.start != "new")
+    starts = processes.all_texts(" ".join(own))
+    if others := [f"process {i} has {start}" for i, start in enumerate(starts) if start != starts[0]]:
+        raise processes.AgreedError(
+            f"process 0 has {starts[0]}, {', '.join(others)}: give all processes the same command; a script decides "
+            "once for all of them whether to resume"
+        )
 
 
 def score_table(metrics: Mapping[str, float], title: str) -> str:

@@ -80,6 +80,34 @@ def test_joined_processes_read_and_keep_no_programs(tmp_path, monkeypatch):
     assert not [path for path in tmp_path.rglob("*") if path.is_file()]
 
 
+UNEVEN = """
+import os, sys
+port, index = sys.argv[1], int(sys.argv[2])
+os.environ["XLA_FLAGS"] = f"--xla_force_host_platform_device_count={2 - index}"
+from tflane_jax import processes
+from tflane_jax.errors import UserError
+try:
+    processes.join(f"localhost:{port}", 2, index)
+except UserError as error:
+    print(error)
+"""
+
+
+@pytest.mark.slow
+def test_processes_with_different_numbers_of_devices_are_refused():
+    """Regression: each printed a traceback of numpy, which could not arrange three devices in rows of two."""
+    port = str(free_port())
+    for code, out, errors in ended([["-c", UNEVEN, port, str(i)] for i in range(2)]):
+        assert code == 0, errors
+        assert out.startswith("the processes have different numbers of devices: process 0 has 2, process 1 has 1; give")
+
+
+def test_the_processes_with_another_number_of_devices_are_named():
+    with pytest.raises(UserError, match="process 0 has 1, process 2 has 2, process 3 has 0; give all as many"):
+        processes._check_devices([0, 1, 2, 2], 4)
+    processes._check_devices([1, 0, 0, 1], 2)
+
+
 @pytest.fixture(scope="module", params=with_slow([2, 4], quick=[2]))
 def trained(request, tmp_path_factory):
     folder = tmp_path_factory.mktemp("processes") / "run"

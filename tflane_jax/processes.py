@@ -15,7 +15,7 @@ import os
 import signal
 import sys
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, TypeVar
 
 import jax
@@ -60,7 +60,8 @@ def join(coordinator: str | None, processes: int | None, process: int | None) ->
         process: number of this one, from 0.
 
     Raises:
-        UserError: one of the three is missing or out of range, no cluster is found, or the others do not come.
+        UserError: one of the three is missing or out of range, no cluster is found, the others do not come, or the
+            processes have different numbers of devices (the same error in all).
     """
     given = (coordinator, processes, process)
     if any(value is None for value in given) and any(value is not None for value in given):
@@ -87,6 +88,20 @@ def join(coordinator: str | None, processes: int | None, process: int | None) ->
             ) from error
         raise UserError(f"the processes of this training cannot be joined: {str(error).splitlines()[0]}") from error
     jax.config.update("jax_enable_compilation_cache", False)
+    _check_devices([device.process_index for device in jax.devices()], jax.process_count())
+
+
+def _check_devices(owners: Sequence[int], count: int) -> None:
+    """Raise UserError where the `count` processes have different numbers of devices: none could exchange anything.
+
+    `owners` has the process of each device. All processes know the devices of all.
+    """
+    numbers = [owners.count(process) for process in range(count)]
+    if others := [f"process {i} has {number}" for i, number in enumerate(numbers) if number != numbers[0]]:
+        raise UserError(
+            f"the processes have different numbers of devices: process 0 has {numbers[0]}, {', '.join(others)}; give "
+            "all as many (CUDA_VISIBLE_DEVICES or JAX_LOCAL_DEVICE_IDS choose them)"
+        )
 
 
 def process_count() -> int:

@@ -215,6 +215,7 @@ def test_the_command_line_trains_on_two_processes(tmp_path):
     (code, out, errors), (other, nothing, _) = ended([[*train, str(folder), *joined, str(i)] for i in range(2)])
     assert (code, other) == (0, 0), errors
     assert "2 processes, 2 devices (cpu)" in errors
+    assert "evaluation.batch_size" not in errors  # 2, which both share
     assert f"{folder}: 4 steps" in out
     assert "steps" not in nothing
     assert Checkpoints(folder / "checkpoints").steps() == [2, 4]

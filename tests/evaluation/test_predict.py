@@ -2,12 +2,13 @@
 
 from dataclasses import dataclass
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from tflane_jax.evaluation import predict
-from tflane_jax.evaluation.predict import predicted_batches, predictions
+from tflane_jax.evaluation.predict import predicted_batches, predictions, undivided_notices
 
 FACTOR = jnp.float32(2.0)
 
@@ -51,3 +52,16 @@ def test_the_next_batch_runs_while_the_caller_reads_one(streams, monkeypatch):
     ahead = [(batch["number"].tolist(), len(started)) for _, batch, _ in read]
     # The last batch is filled up with copies of the last example.
     assert ahead == [([1.0, 2.0], 2), ([3.0, 4.0], 3), ([5.0, 5.0], 3)]
+
+
+@pytest.mark.parametrize(
+    ("devices", "batch_size", "best"), [(1, 16, None), (8, 16, None), (32, 16, 32), (3, 16, 18), (2, 1, 2)]
+)
+def test_devices_that_an_evaluation_does_not_use_are_told_of(devices, batch_size, best, monkeypatch):
+    monkeypatch.setattr(jax, "device_count", lambda: devices)
+    assert undivided_notices(Times(streams=True), batch_size) == []
+    notices = undivided_notices(Times(), batch_size)
+    assert len(notices) == (best is not None)
+    for notice in notices:
+        assert notice.startswith(f"evaluation.batch_size {batch_size} is no multiple of {devices} devices, so one ")
+        assert notice.endswith(f" everything: {best} would use all")

@@ -20,6 +20,7 @@ from tflane_jax.errors import UserError
 from tflane_jax.evaluation.edge_types import weights_edge_types
 from tflane_jax.evaluation.interventions import with_traffic
 from tflane_jax.evaluation.lane_errors import lane_errors
+from tflane_jax.evaluation.predict import undivided_notices
 from tflane_jax.plots.tables import format_table, save_table, written_to
 from tflane_jax.runs import Run, evaluate_run
 from tflane_jax.scene import stack_examples
@@ -28,6 +29,7 @@ from tflane_jax.tasks.base import Model
 from tflane_jax.tasks.edge_types import save_edge_types
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.tasks.lane_shape import LaneShapeTask
+from tflane_jax.training.notices import print_notices
 from tflane_jax.training.runtime import configure_jax
 from tflane_jax.training_nearness import training_nearness
 
@@ -59,6 +61,7 @@ def run(options: argparse.Namespace) -> int:
     of_weights = Path("runs") / "evaluations" / f"{Path(trained.name).stem}-{name}"
     stem = options.out or (of_weights if options.config else Path(trained.name) / "evaluations" / name)
     check_table(stem)
+    print_notices(undivided_notices(task or trained.config.task, evaluation.batch_size))
     protocol, rows = evaluate_run(trained, source, task=task, frame_groups=groups)
     title = f"{trained.name}, {name}: {protocol}"
     meta = {

@@ -20,11 +20,13 @@ from tflane_jax.config_help import explained
 from tflane_jax.config_io import from_json, to_json
 from tflane_jax.config_overrides import apply_overrides, batch_notices, unread_notices
 from tflane_jax.errors import UserError
+from tflane_jax.evaluation.predict import undivided_notices
 from tflane_jax.files.wording import counted
 from tflane_jax.own_modules import imports_of
 from tflane_jax.plots.tables import format_table
 from tflane_jax.progress import write
 from tflane_jax.runs import resumable_config, train_run
+from tflane_jax.training.notices import print_notices
 from tflane_jax.training.runtime import configure_jax
 
 _NOT_BEGUN = " before the run began: give the same command again"
@@ -51,6 +53,8 @@ def _trained(options: argparse.Namespace, overrides: Sequence[str]) -> int:
     out = options.out or _default_folder(options.config)
     config = _config(options, out, overrides)
     _print_devices()
+    if processes.is_first():
+        print_notices(undivided_notices(config.task, config.evaluation.batch_size))
     before, own = _saved_at(out), imports_of(config)
     resume = f"go on with: tflane train --resume --out {shlex.quote(str(out))}{own}"
     try:

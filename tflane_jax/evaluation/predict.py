@@ -17,7 +17,7 @@ from tflane_jax.datasets.batches import ordered_batches
 from tflane_jax.datasets.loading import keep
 from tflane_jax.devices import divided, everywhere, prediction_mesh, replicated, share
 from tflane_jax.models.parameters import Params
-from tflane_jax.processes import all_rows
+from tflane_jax.processes import all_rows, process_count
 from tflane_jax.scene import Example, Prediction, stack_examples
 from tflane_jax.startup import compiled
 
@@ -120,6 +120,18 @@ def predicted_batches(
             yield predicted
     if running is not None:
         yield _fetched(*running)
+
+
+def undivided_notices(task: Predictor, batch_size: int) -> list[str]:
+    """Return what to tell where an evaluation uses one of several devices, because they cannot share its batches."""
+    devices = jax.device_count()
+    if task.streams or batch_size % devices == 0:
+        return []
+    lone = "each process predicts everything on one" if process_count() > 1 else "one predicts everything"
+    return [
+        f"evaluation.batch_size {batch_size} is no multiple of {devices} devices, so {lone}: "
+        f"{-(-batch_size // devices) * devices} would use all"
+    ]
 
 
 def _fetched(indices: range, batch: Any, answers: Prediction) -> tuple[range, Any, Prediction]:

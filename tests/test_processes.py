@@ -212,10 +212,11 @@ def test_the_command_line_trains_on_two_processes(tmp_path):
     (tmp_path / "tiny.py").write_text(TINY)
     folder, joined = tmp_path / "run", ["--coordinator", f"localhost:{free_port()}", "--processes", "2", "--process"]
     train = ["-m", "tests.slow_start", "nothing", "train", "--config", str(tmp_path / "tiny.py:baseline"), "--out"]
-    (code, out, errors), (other, nothing, _) = ended([[*train, str(folder), *joined, str(i)] for i in range(2)])
+    (code, out, errors), (other, nothing, quiet) = ended([[*train, str(folder), *joined, str(i)] for i in range(2)])
     assert (code, other) == (0, 0), errors
     assert "2 processes, 2 devices (cpu)" in errors
     assert "evaluation.batch_size" not in errors  # 2, which both share
+    assert ("loading fake" in errors, "loading fake" in quiet) == (True, False)
     assert f"{folder}: 4 steps" in out
     assert "steps" not in nothing
     assert Checkpoints(folder / "checkpoints").steps() == [2, 4]

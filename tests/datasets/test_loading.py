@@ -37,6 +37,17 @@ def test_arrays_are_the_examples_stacked(dataset):
     assert_same(arrays, stack_examples([FakeDataset(FakeConfig()).example(i) for i in range(5)]))
 
 
+@pytest.mark.parametrize("process", [0, 1])
+def test_the_first_process_shows_that_it_loads_and_each_that_it_builds(process, tmp_path, monkeypatch, capsys):
+    """Regression: all showed the loading. A cache is built by one process, which need not be the first."""
+    monkeypatch.setattr(jax, "process_index", lambda: process)
+    load_arrays(FakeDataset(FakeConfig(size=5)))
+    cached(FakeDataset(FakeConfig(size=5)), root=tmp_path, workers=1)
+    shown = capsys.readouterr().err
+    assert ("loading fake: 100%" in shown) == (process == 0)
+    assert "building fake: 100%" in shown
+
+
 def test_parts_that_are_not_asked_for_are_dropped(dataset):
     arrays = load(dataset, parts=("lanes",))
     assert arrays.bev is arrays.hidden is arrays.traffic_flow is arrays.traffic_elements is None

@@ -19,6 +19,7 @@ from tflane_jax.datasets.leaves import Form, check_form, example_from_leaves, ex
 from tflane_jax.datasets.plausible import check_lanes
 from tflane_jax.datasets.streaming import InOrder, Streamed, StreamingConfig
 from tflane_jax.errors import UserError
+from tflane_jax.processes import is_first
 from tflane_jax.progress import progress_bar
 from tflane_jax.scene import Areas, Example, LaneGraph
 
@@ -83,7 +84,8 @@ def load_arrays(
     Args:
         dataset: a `CachedDataset` is read at the speed of the disk, any other dataset example by example.
         parts: fields of `Example` to keep, default all; see `keep`.
-        progress: show a bar with rate and time left where examples are made one by one.
+        progress: show a bar with rate and time left where examples are made one by one, in the first of several
+            processes.
         workers: make the examples of a dataset that is not cached; None makes them in this thread.
 
     Returns:
@@ -116,7 +118,8 @@ def _stacked(
     count, examples = len(dataset), map(partial(made, dataset), range(len(dataset)))
     if workers is not None:
         examples = Streamed(dataset, workers).stream(InOrder(count), count)
-    bar = progress_bar(examples, f"loading {dataset.name}", unit="example", total=count, disable=not progress)
+    shown = progress and is_first()  # of several processes, which all read the same
+    bar = progress_bar(examples, f"loading {dataset.name}", unit="example", total=count, disable=not shown)
     first: Form = {}
     for index, example in enumerate(bar):
         found = example_leaves(example)

@@ -39,6 +39,7 @@ from tflane_jax.errors import UserError
 from tflane_jax.files.fields import file_within
 from tflane_jax.files.images import read_image, resize
 from tflane_jax.files.tusimple import NO_DRIVES, RowLanes, read_truth
+from tflane_jax.processes import is_first
 from tflane_jax.progress import progress_bar
 from tflane_jax.scene import LaneLines, RoadImage
 
@@ -159,9 +160,10 @@ def load_road_images(dataset: TuSimpleDataset, *, progress: bool = True, workers
         images[index] = example.image
         return example.lines
 
+    shown = progress and is_first()  # of several processes, which all read the same
     with ThreadPoolExecutor(workers) as pool:
         bar = progress_bar(
-            pool.map(load, range(count)), f"loading {dataset.name}", unit="image", total=count, disable=not progress
+            pool.map(load, range(count)), f"loading {dataset.name}", unit="image", total=count, disable=not shown
         )
         try:
             lines = list(bar)

@@ -100,6 +100,17 @@ def test_the_first_training_of_the_readme_is_not_refused():
     make_optimizer(config.optim, config.training.steps)  # refuses a warm-up that does not end
 
 
+def test_trainings_of_the_page_on_32_devices_can_share_their_batches():
+    """Regression: they kept the batch of eight of their configuration, and were refused."""
+    text = PAGES["docs/scale.md"].replace("\\\n", " ")
+    lines = re.findall(r"^(?:srun .*)?(tflane train --config .*(?:--processes 4|--distributed).*)$", text, re.MULTILINE)
+    assert len(lines) == 2
+    for line in lines:
+        options, rest = build_parser().parse_known_args(shlex.split(line)[1:])
+        config = apply_overrides(_config(options.config), rest)
+        assert (config.training.batch_size % 32, config.evaluation.batch_size % 32) == (0, 0)
+
+
 @pytest.mark.parametrize(
     ("command", "said"),
     [

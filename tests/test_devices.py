@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from tests.shared import ROOT
+from tests.training.divided_losses import CASES, losses
 from tests.training.many_devices import BATCH, EVENLY, assignments, host_terms, in_parts, normalised, predicted
 from tests.training.stub_run import run
 from tests.training.test_loop import arrays, timeless
@@ -22,9 +23,14 @@ from tflane_jax.training.vectors import ROW
 def forced(request, tmp_path_factory):
     """Return the folder of a process with so many devices, and what it says."""
     folder = tmp_path_factory.mktemp("devices")
-    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={request.param}"
+    return folder, said_on(request.param, "tests.training.many_devices", str(folder))
+
+
+def said_on(devices, module, argument):
+    """Return what a module says in a process with so many devices."""
+    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={devices}"
     ended = subprocess.run(
-        [sys.executable, "-m", "tests.training.many_devices", str(folder)],
+        [sys.executable, "-m", module, argument],
         cwd=ROOT,
         env=os.environ | {"XLA_FLAGS": flags},
         capture_output=True,
@@ -33,8 +39,8 @@ def forced(request, tmp_path_factory):
     )
     assert ended.returncode == 0, ended.stderr
     facts = json.loads(ended.stdout.splitlines()[-1])
-    assert facts["devices"] == request.param
-    return folder, facts
+    assert facts["devices"] == devices
+    return facts
 
 
 def test_training_gives_the_numbers_of_one_device(forced, tmp_path):
@@ -131,6 +137,17 @@ def test_a_host_has_the_loss_and_the_gradient_of_one_device(forced):
         pytest.skip("compiled for two devices only")
     for name, value in host_terms().items():
         np.testing.assert_allclose(found[name], value, rtol=1e-6, err_msg=name)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CASES)
+def test_models_with_batch_norms_and_dropout_have_the_losses_of_one_device(name):
+    expected, found = losses(name), said_on(2, "tests.training.divided_losses", name)["losses"]
+    assert found.keys() == expected.keys()
+    assert any("batch_stats" in term for term in expected)
+    for term, value in expected.items():
+        near_zero = 1e-6 if "batch_stats" in term else 0.0  # means of a channel, whose parts cancel
+        np.testing.assert_allclose(found[term], value, rtol=1e-6, atol=near_zero, err_msg=term)
 
 
 def test_a_batch_that_cannot_be_shared_evenly_is_refused(forced):

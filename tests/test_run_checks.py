@@ -19,7 +19,7 @@ from tflane_jax.geometry import PerceptionRange
 from tflane_jax.limits import SettingError
 from tflane_jax.run_checks import agree_on_settings, check_run
 from tflane_jax.training.restarts import RestartsConfig
-from tflane_jax.training.run_folder import fixed
+from tflane_jax.training.run_folder import without_workers
 from tflane_jax.training.schedule import DropsConfig
 
 NAN, INF = math.nan, math.inf
@@ -311,9 +311,12 @@ def test_processes_with_other_settings_or_code_are_told(monkeypatch):
     def first_has(**other):
         monkeypatch.setattr("tflane_jax.run_checks.from_first", lambda found: found() | other)
 
-    first_has(settings=fixed(to_json(with_setting(config, "optim.lr", 0.5))))
-    with pytest.raises(UserError, match=r"not those of the first process \(optim\.lr: 0\.5 there, .* here\)"):
-        agree_on_settings(config)
+    for setting, value in (("optim.lr", 0.5), ("evaluation.batch_size", 5), ("training.shard_state", True)):
+        first_has(settings=without_workers(to_json(with_setting(config, setting, value))))
+        with pytest.raises(UserError, match=rf"not those of the first process \({setting}: {value} there, .* here\)"):
+            agree_on_settings(config)
+    first_has(settings=without_workers(to_json(with_setting(config, "data.loading.threads", 7))))
+    agree_on_settings(config)
     first_has(code="another")
     with pytest.raises(UserError, match="own modules have other code than those of the first process"):
         agree_on_settings(config)

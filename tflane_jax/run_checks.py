@@ -22,7 +22,7 @@ from tflane_jax.tasks.base import AnyTask
 from tflane_jax.tasks.lane_shape import LaneShapeTask
 from tflane_jax.training.fine_tuning import check_origin_params
 from tflane_jax.training.rate_factors import factor_of_leaves
-from tflane_jax.training.run_folder import fixed
+from tflane_jax.training.run_folder import without_workers
 from tflane_jax.training.vectors import layout_of
 
 EXAMPLE_NAMES = {Example: "lane graphs", RoadImage: "images"}
@@ -34,7 +34,7 @@ def agree_on_settings(config: RunConfig) -> None:
 
     Each would take part in every update with a program of its own, or wait for ever for an evaluation of the others.
     """
-    mine = {"settings": fixed(to_json(config)), "code": own_code(config)}
+    mine = {"settings": without_workers(to_json(config)), "code": own_code(config)}
     first = from_first(lambda: mine)
     with agreed():
         if difference := first_difference(first["settings"], mine["settings"]):

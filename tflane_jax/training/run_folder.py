@@ -72,10 +72,16 @@ def fixed(config: dict[str, Any]) -> dict[str, Any]:
     That is where the devices hold its state, the workers that load examples, and what an evaluation needs of memory and
     draws: neither batches nor scores depend on these.
     """
-    config = dict(config)
+    config = without_workers(config)
     for part, names in _FREE.items():
         if isinstance(settings := config.get(part), dict):
             config[part] = {name: value for name, value in settings.items() if name not in names}
+    return config
+
+
+def without_workers(config: dict[str, Any]) -> dict[str, Any]:
+    """Return a configuration (JSON) without what each process of a training may choose: the workers that load."""
+    config = dict(config)
     if isinstance(loading := value_at(config, "data.loading"), dict):
         others = {name: value for name, value in loading.items() if name not in _WORKERS}
         config |= {"data": config["data"] | {"loading": others}}

@@ -81,6 +81,25 @@ def test_a_remark_on_several_tables_stands_on_the_page_once(tmp_path):
     assert remarks[:4] == [["Of one"], ["on x1 holds here"], ["Of two"], []]
 
 
+def test_a_remark_on_runs_stays_as_long_as_one_of_them_is_recorded(tmp_path, monkeypatch):
+    for name, replaced in (("read_archive", None), ("write_archive", None), ("merged", None), ("can_draw", False)):
+        monkeypatch.setattr(published, name, lambda *_, replaced=replaced: replaced)
+    summary = dict.fromkeys(("table", "title", "protocol", "declared"), "x") | {"seeds": [0], "steps": [1], "rows": []}
+    summary |= {"cores of a run": [1], "devices": [], "core minutes of a run": {"a": 1.0}, "quick": False}
+    summary |= {"findings": [], "effects": [], "runs begun": 0, "quoted": {"rows": []}}
+    folder = tmp_path / "results"
+    folder.mkdir()
+    old = summary | {
+        "commits": ["old", "older"],
+        "remark on runs": {"remark": "trained with an error.", "commits": ["old", "older"]},
+    }
+    (folder / "x.json").write_text(json.dumps(old))
+    for commits, told in ((["old", "older"], True), (["new", "older"], True), (["new"], False), (["new"], False)):
+        (tmp_path / "summary.json").write_text(json.dumps(summary | {"commits": commits}))
+        written = record([tmp_path / "summary.json"], folder).read_text()
+        assert ("x: trained with an error." in written) == told
+
+
 def test_the_page_names_tables_whose_claims_were_declared_late(tmp_path):
     summary = dict.fromkeys(("title", "protocol"), "x") | {"seeds": [0], "steps": [1], "rows": []}
     summary |= {"cores of a run": [1], "commits": [], "devices": [], "core minutes of a run": {"a": 1.0}}

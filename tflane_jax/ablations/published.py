@@ -50,13 +50,16 @@ def record(summaries: Sequence[Path], folder: Path) -> Path:
         new, place = read_archive(path.with_name(FILE)), archive_path(folder, name)
         write_archive(place, merged(read_archive(place), new) if place.exists() else new)
         there, seeds = folder / f"{name}.json", set(member(content, "seeds", str(path)))
-        if there.exists() and (lost := _lost(load_json(there), content, there)):
+        before = load_json(there) if there.exists() else {}
+        if before and (lost := _lost(before, content, there)):
             print(
                 f"{name}: the runs of seeds {_listed(sorted(seeds))} were added to the record; its table stays that of "
                 f"before, which also has {lost}. For a table of all: tflane tables {name} --from {folder} "
                 f"--record {folder}, with --seeds for some of them"
             )
             continue
+        if (remark := before.get("remark on runs")) and {*remark["commits"]} & {*content["commits"]}:
+            content = {**content, "remark on runs": remark}
         write_text(there, json.dumps(content, indent=1) + "\n")
     written = write_text(folder.with_name(f"{folder.name}.md"), page(folder))
     if can_draw():
@@ -108,11 +111,10 @@ def page(folder: Path) -> str:
         "`docs/results/`; do not edit it. The papers' own numbers are of other data and stand there for orientation.",
         "A claim is *shown* or *contradicted* if the corrected p over seeds and the interval over scenes say so, else",
         "*not shown* ([how](comparisons.md)). Scores other than recall have no interval where an earlier version",
-        "measured them: there p alone decides. All tables but those of markers, the long ones, gtn_lane.1 and",
-        "small_host.3 were trained before commit 33c1f339, which fixed a gradient",
-        "([a control](comparisons.md#the-papers-tables)): runs of one configuration before and after it are not the",
-        "same.",
+        "measured them: there p alone decides.",
     ]
+    for remark, tables in _remarks_on_runs(found).items():
+        lines += ["", *_wrapped(f"{', '.join(tables)}: {remark}")]
     linked = {f"[{name}](#{_anchor(each)}){_if_interim(each)}": each for name, each in found.items()}
     if claims := [claim_row(name, record) for name, each in linked.items() for record in each["effects"]]:
         lines += ["", "## All claims", "", *_wrapped(_CLAIMS + _declared_late(found)), "", format_table(claims)]
@@ -131,6 +133,18 @@ def page(folder: Path) -> str:
             *_wrapped(", ".join(f"`{name}` ({TABLES[name].title})" for name in missing)),
         ]
     return "\n".join(lines) + "\n"
+
+
+def _remarks_on_runs(found: Mapping[str, Mapping[str, Any]]) -> dict[str, list[str]]:
+    """Return the tables by the remark on their runs.
+
+    It was written into a summary by hand, with the commits that it is about, and goes with the last run of these.
+    """
+    tables: dict[str, list[str]] = {}
+    for name, summary in found.items():
+        if remark := summary.get("remark on runs"):
+            tables.setdefault(remark["remark"], []).append(name)
+    return tables
 
 
 def _declared_late(found: Mapping[str, Mapping[str, Any]]) -> str:
@@ -157,7 +171,7 @@ def summaries(folder: Path) -> dict[str, Mapping[str, Any]]:
 
 def _check(summary: Any, path: Path) -> None:
     """Raise UserError for a file that is no summary, or one without what this version reads."""
-    for field in ("table", "findings", "rows", "quoted"):
+    for field in ("table", "findings", "rows", "quoted", "commits"):
         member(summary, field, str(path))
     records_of(summary, str(path))
     member(summary, "runs begun", str(path))

@@ -33,7 +33,8 @@ def ablations() -> dict[str, RunConfig]:
 
     `mixed_bev` is `mixed` with the tracks written into the BEV features as well, which is ours.
 
-    `generated` has seen no recorded map: a control with the same capacities, steps and test data. Its own controls:
+    `generated` has seen no recorded map: a control with the same capacities, steps and test data. It is validated on
+    the maps, so that they choose its best checkpoint: test it with `--checkpoint last`. Its own controls:
     `generated_right_hand`, where all traffic keeps to the right, and `generated_city`, on the preset `city`.
     """
     sources = {"mixed": replace(MAPS, generated=0.5), "generated": replace(MAPS, generated=1.0)}

@@ -60,6 +60,7 @@ def test_weights_that_no_training_wrote_are_not_resumed(config, tmp_path):
     assert saved is not None
     with pytest.raises(UserError, match=r"none to resume: start one from them, --training.init-from \S*own, in"):
         carried(checkpoints, saved, [])
+    assert not open_run(tmp_path / "own").chosen  # by no score
 
 
 def test_a_start_from_another_model_is_told_before_data_are_read(config, tmp_path, monkeypatch):

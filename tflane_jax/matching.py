@@ -1,7 +1,7 @@
 """Bipartite (Hungarian) matching of queries to targets.
 
 Two backends give the same assignments, as long as costs have no ties and none is so large that float32 loses the
-differences of other pairs: near the limit of 1e6, or large and negative where a query is chosen by it. "jax" runs on
+differences of other pairs: near the limit of 1e6, or a large negative cost in the chosen assignment. "jax" runs on
 the device, in a program that JAX can keep between processes (persistent compilation cache), and takes as long as scipy
 at the sizes of small models. "scipy" runs on the host: one call per step for every layer and example, because the
 callback receives `vmap`ped axes as batch axes and loops over them. A program with a host callback can be neither

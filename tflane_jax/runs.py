@@ -61,12 +61,14 @@ class Run:
         config: resolved configuration, as stored in the checkpoint.
         step: number of optimizer updates.
         params: averaged parameters of each seed, in the order of `config.training.seeds`.
+        chosen: whether the step was chosen among several by their scores in the validation split.
     """
 
     name: str
     config: RunConfig
     step: int
     params: tuple[Params, ...]
+    chosen: bool = False
 
 
 def train_run(
@@ -229,7 +231,7 @@ def open_run(folder: Path | str, which: Which | None = None) -> Run:
     params = per_seed(averaged, seeds)
     if _is_edited(plain, last, folder):
         check_model(config, params[0], str(checkpoints.path(step)))
-    return Run(str(folder), config, step, tuple(params))
+    return Run(str(folder), config, step, tuple(params), chosen=which == "best" and last > config.training.eval_every)
 
 
 def _is_edited(checkpoints: Checkpoints, step: int, folder: Path) -> bool:

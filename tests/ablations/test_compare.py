@@ -147,4 +147,4 @@ def test_rows_whose_best_checkpoint_is_chosen_by_test_examples_are_named(name, n
     monkeypatch.setattr("tflane_jax.ablations.compare.plan_jobs", planned)
     with pytest.raises(UserError, match="planned"):
         compare({"host": load_config(name)}, [0], tmp_path)
-    assert ("host: validation and test examples are the same" in capsys.readouterr().err) == named
+    assert ("host: the best checkpoint is chosen by the test examples" in capsys.readouterr().err) == named

@@ -40,6 +40,7 @@ def test_arrays_are_the_examples_stacked(dataset):
 @pytest.mark.parametrize("process", [0, 1])
 def test_the_first_process_shows_that_it_loads_and_each_that_it_builds(process, tmp_path, monkeypatch, capsys):
     """Regression: all showed the loading. A cache is built by one process, which need not be the first."""
+    monkeypatch.setattr(jax.distributed, "is_initialized", lambda: True)
     monkeypatch.setattr(jax, "process_index", lambda: process)
     load_arrays(FakeDataset(FakeConfig(size=5)))
     cached(FakeDataset(FakeConfig(size=5)), root=tmp_path, workers=1)

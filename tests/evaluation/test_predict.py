@@ -62,6 +62,9 @@ def test_devices_that_an_evaluation_does_not_use_are_told_of(devices, batch_size
     assert undivided_notices(Times(streams=True), batch_size) == []
     notices = undivided_notices(Times(), batch_size)
     assert len(notices) == (best is not None)
+    said = f"{devices} devices cannot share batches of {batch_size} (evaluation.batch_size), so that"
     for notice in notices:
-        assert notice.startswith(f"evaluation.batch_size {batch_size} is no multiple of {devices} devices, so one ")
-        assert notice.endswith(f" everything: {best} would use all")
+        assert notice == f"{said} one predicts everything: batches of {best} would use all"
+    monkeypatch.setattr(predict, "process_count", lambda: 2)
+    for notice in undivided_notices(Times(), batch_size):
+        assert notice == f"{said} each process predicts everything on one device: batches of {best} would use all"

@@ -198,7 +198,7 @@ def test_a_part_gets_its_part_of_the_rain():
         return develop(np.random.default_rng(3), np.full((height, width, 3), 90, np.uint8), rain, 1.5, window)
 
     whole, part = image(360, 640), image(90, 140, Window((640, 360), (200, 120)))
-    # Lens and image border: streaks from above the part reach into it.
+    # Without the border, where the lens blur of the part lacks its neighbours. Streaks from above reach into the part.
     np.testing.assert_array_equal(part[3:-3, 3:-3], whole[120:210, 200:340][3:-3, 3:-3])
     assert 0.005 < (part.max(-1) > np.median(part) + 3).mean() < 0.2
     np.testing.assert_array_equal(image(360, 640, Window((640, 360), (0, 0))), whole)

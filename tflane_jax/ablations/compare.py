@@ -124,8 +124,9 @@ def _check_names(configs: Mapping[str, RunConfig]) -> None:
 def _chosen_on_test(configs: Mapping[str, RunConfig]) -> list[str]:
     """Return the notice for rows whose best checkpoint is chosen by the examples that they are tested on."""
     names = [name for name, config in configs.items() if config.chosen_by(config.data.source("test"))]
-    said = "validation and test examples are the same, so that rows of the best checkpoint are too good by chance"
-    return [f"{', '.join(names)}: {said}; those of the last one are not chosen"] if names else []
+    reason = "the best checkpoint is chosen by the test examples, because validation and test are the same"
+    effect = "its scores are too good by chance, those of the last one are not"
+    return [f"{', '.join(names)}: {reason}; {effect}"] if names else []
 
 
 def _check_tests(configs: Mapping[str, RunConfig], tests: Tests) -> None:

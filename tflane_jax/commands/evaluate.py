@@ -81,7 +81,7 @@ def run(options: argparse.Namespace) -> int:
         print(f"tflane: warning: {name} has no true lane: scores are those of an empty truth", file=sys.stderr)
     if near is not None:
         print(f"\n{near.sentence()}")
-    if options.checkpoint in (None, "best") and not options.config and trained.config.chosen_by(source):
+    if trained.chosen and trained.config.chosen_by(source):
         print(
             f"\nStep {trained.step} was chosen as the best one by these examples: its scores are too good by chance. "
             "--checkpoint last was not chosen."

@@ -20,7 +20,7 @@ from tflane_jax.datasets.packed_lines import PackedLines
 from tflane_jax.datasets.shapely_polygons import flat_rings, import_shapely
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import PerceptionRange
-from tflane_jax.geometry.polylines import clip_to_range, simplify
+from tflane_jax.geometry.polylines import clip_to_range, simplify, without_repeats
 from tflane_jax.geometry.rings import from_first_corner, oriented
 from tflane_jax.scene import LineClass
 
@@ -317,6 +317,4 @@ def _simple_paths(roots: Sequence[int], following: dict[int, list[int]]) -> list
 
 def _concatenated(lines: Sequence[np.ndarray]) -> np.ndarray:
     """Return one line; a point that follows an equal one is left out."""
-    points = np.concatenate(lines)
-    new = (points[1:, :2] != points[:-1, :2]).any(-1)
-    return points[np.concatenate([[True], new])]
+    return without_repeats(np.concatenate(lines), 0.0)

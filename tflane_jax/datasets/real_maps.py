@@ -137,8 +137,7 @@ class RealMapData:
             tracks, see `recorded_logs`.
         test_traffic: name of a log whose recorded tracks replace those of the test split's logs, a control: plausible
             traffic in the wrong place; "" for their own.
-        generated: fraction of the training scenes on generated roads; where it is 1, the validation scenes are on
-            such roads, too, unless `val_logs` names maps: no map takes part in the choice of the best checkpoint.
+        generated: fraction of the training scenes on generated roads.
         world: traffic, tracker and key frames of the scenes on maps.
         generated_world: all of the scenes on generated roads.
         example: what is in an example, and its capacities.
@@ -175,14 +174,13 @@ class RealMapData:
             logs, traffic = self.test_logs, self.test_traffic
             return RecordedConfig(self.maps, logs, without, traffic, self.example, self.loading)
         logs = {"train": (), "val": self.val_logs, "test": self.test_logs}[split]
-        no_maps = self.generated == 1.0 and not logs
         return RealMapConfig(
             self.maps,
             logs=logs,
             without=() if logs else tuple(sorted({*self.val_logs, *self.test_logs, *self.without})),
             split=split,
             scenes=getattr(self, split),
-            generated=self.generated if split == "train" or (split == "val" and no_maps) else 0.0,
+            generated=self.generated if split == "train" else 0.0,
             world=self.world,
             generated_world=self.generated_world,
             example=self.example,

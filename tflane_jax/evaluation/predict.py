@@ -127,9 +127,9 @@ def undivided_notices(task: Predictor, batch_size: int) -> list[str]:
     devices = jax.device_count()
     if task.streams or batch_size % devices == 0:
         return []
-    lone = "each process predicts everything on one" if process_count() > 1 else "one predicts everything"
+    lone = "each process predicts everything on one device" if process_count() > 1 else "one predicts everything"
     return [
-        f"evaluation.batch_size {batch_size} is no multiple of {devices} devices, so {lone}: "
+        f"{devices} devices cannot share batches of {batch_size} (evaluation.batch_size), so that {lone}: batches of "
         f"{-(-batch_size // devices) * devices} would use all"
     ]
 

@@ -136,7 +136,8 @@ class RelationshipHead(nn.Module):
         second = nn.Dense(width, use_bias=False, name="pair_second")(b)
         pair = nn.relu(first[:, None] + second[None, :])
         pair = nn.relu(nn.Dense(width, name="pair_hidden")(pair))
-        # also where the layers compute in bfloat16, whose 8 bits would give many pairs the same score
+        # In the type that came in, float32, also if the layers compute in bfloat16: with its 8 bits, many pairs would
+        # have the same score.
         return nn.Dense(1, dtype=dtype, name="pair_out")(pair)[..., 0]
 
 

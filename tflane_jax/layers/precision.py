@@ -1,8 +1,8 @@
 """Precision and memory of a part of a model: bfloat16 projections, activations computed again for the gradient.
 
 In bfloat16, linear layers and convolutions take bfloat16 inputs and kernels, and attention multiplies what they give.
-Parameters, biases and their gradients, residual sums, layer norms, softmax, sampling locations and the outputs of a
-part are float32. The backbone and the depth network keep bfloat16 between their layers.
+Parameters, biases and their gradients, residual sums, layer norms, softmax, sampling locations, logits of edges and the
+outputs of a part are float32. The backbone and the depth network keep bfloat16 between their layers.
 """
 
 from __future__ import annotations

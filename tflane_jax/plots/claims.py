@@ -63,7 +63,7 @@ def save_claims(path: Path, claims: Mapping[str, Sequence[Claim]], headings: Map
     ax.tick_params(axis="y", length=0)
     ax.set_ylim(len(lines) - 0.5, -0.5)
     ax.grid(axis="x", lw=0.4, alpha=0.6)
-    ax.set_xlabel("treatment minus control, points; bar: 95 % interval over scenes")
+    ax.set_xlabel("treatment minus control, points (distances: metres); bar: 95 % interval over scenes")
     there = {claim["verdict"] for _, claim in lines if claim is not None}
     entries = [
         Line2D([], [], marker="o", ls="", color=colour, label=name)

@@ -41,7 +41,7 @@ def _with_and_without(
     steps: int,
     minutes: float,
     quoted: Quoted,
-    first: tuple[str, *tuple[Reported, ...]],
+    papers: tuple[str, *tuple[Reported, ...]],
     note: str = "",
 ) -> PaperTable:
     """Return the table of one host: without and with the TFM, each traffic reading, and the controls."""
@@ -58,7 +58,7 @@ def _with_and_without(
             TableRow(f"{bev}, control", f"tf_lane/{host}_tfm:street_bev_control"),
         ),
         claims=(
-            claim(tfm, label, *first),
+            claim(tfm, label, *papers),
             Claim(tfm, f"{tfm}, control", "the gain is the traffic's, not the added layers'"),
             Claim(bev, label, "ours: traffic in the BEV features as well"),
             Claim(bev, f"{bev}, control", "the gain is the traffic's, not the added layers'"),
@@ -133,7 +133,7 @@ TABLES = (
                 "LaneSegNet + TFM *": (35.66, 34.52, 36.79, 27.50),
             },
         ),
-        first=("traffic flow improves LaneSegNet ({})", _gain(2.03)),
+        papers=("traffic flow improves LaneSegNet ({})", _gain(2.03)),
     ),
     _with_and_without(
         2,
@@ -155,7 +155,7 @@ TABLES = (
                 "TopoNet + TFM *": (42.39, 31.22, 47.44, 15.97, 25.96),
             },
         ),
-        first=("traffic flow improves TopoNet ({})", Reported(0.19, "DET_l", 2), Reported(1.17, "OLS", 2)),
+        papers=("traffic flow improves TopoNet ({})", Reported(0.19, "DET_l", 2), Reported(1.17, "OLS", 2)),
         note="There is no DET_t, TOP_lt and OLS: BEV evidence shows no traffic elements, so this host predicts none. "
         "The gains in the first claim are the paper's.",
     ),
@@ -179,7 +179,7 @@ TABLES = (
                 "MapTR + TFM *": (55.80, 58.75, 51.10, 57.57),
             },
         ),
-        first=("traffic flow improves MapTR ({})", Reported(4.1, "mAP")),
+        papers=("traffic flow improves MapTR ({})", Reported(4.1, "mAP")),
     ),
     _with_and_without(
         4,
@@ -201,7 +201,7 @@ TABLES = (
                 "MapTRv2 + TFM *": (63.50, 63.65, 61.76, 65.09),
             },
         ),
-        first=("traffic flow improves MapTRv2 ({})", _gain(1.31)),
+        papers=("traffic flow improves MapTRv2 ({})", _gain(1.31)),
     ),
     _on_lanesegnet(
         5,

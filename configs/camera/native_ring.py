@@ -1,8 +1,8 @@
 """Scenes in the seven cameras of Argoverse 2 at their native 2048 x 1550, to be written in OpenLane-V2's layout.
 
     tflane data export --config camera/native_ring --out data/world
-    tflane train --config camera/toponet_r50 --data.root data/world --training.batch_size 1 \\
-        --training.steps 2 --optim.epoch_steps 0 --optim.warmup_steps 0 --task.model.encoder.images.frozen-stages 0
+    tflane train --config camera/toponet_r50 --data.root data/world --training.batch-size 1 \\
+        --training.steps 2 --optim.epoch-steps 0 --optim.warmup-steps 0 --task.model.encoder.images.frozen-stages 0
 
 The second command makes two updates of the paper-size model, for users without OpenLane-V2.
 """

@@ -2,7 +2,7 @@
 
     tflane summary --config tf_lane/maptr_r50 --no-compile          # needs no data
     tflane train --config tf_lane/maptr_r50 --data.train 8 --data.val 2 --data.test 2 --training.steps 20 \\
-        --optim.epoch_steps 0 --optim.warmup_steps 0 --task.model.encoder.images.frozen-stages 0
+        --optim.epoch-steps 0 --optim.warmup-steps 0 --task.model.encoder.images.frozen-stages 0
 
 The cameras are nuScenes' ring with images of 800 x 480 pixels, as the paper has them. The reference trains 24 epochs of
 28,130 frames on eight GPUs, four frames each. `:bevformer` has BEVFormer's attention to the cameras instead of the

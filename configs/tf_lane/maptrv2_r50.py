@@ -2,7 +2,7 @@
 
     tflane summary --config tf_lane/maptrv2_r50 --no-compile          # needs no data
     tflane train --config tf_lane/maptrv2_r50 --data.train 8 --data.val 2 --data.test 2 --training.steps 20 \\
-        --optim.epoch_steps 0 --optim.warmup_steps 0 --task.model.encoder.images.frozen-stages 0
+        --optim.epoch-steps 0 --optim.warmup-steps 0 --task.model.encoder.images.frozen-stages 0
 
 Cameras, schedule and batch are those of `maptr_r50.py`; the built-in world gives the depth of every image cell.
 `:remat` recomputes activations in the backward pass, `:bfloat16` does so in half precision. `:centerlines` has the

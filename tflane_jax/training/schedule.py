@@ -69,7 +69,7 @@ class OptimConfig:
             "linear", times B / reference_batch (Goyal et al. 2017, for SGD); "sqrt", times the square root of it, often
             used with Adam.
         reference_batch: examples of an update that `lr` was chosen for. None, where `lr_scaling` is set by an override
-            (`--optim.lr_scaling`) or in a configuration file: those that the file, or the ablation named in it, has as
+            (`--optim.lr-scaling`) or in a configuration file: those that the file, or the ablation named in it, has as
             `training.batch_size`.
         lr_factors: (pattern, factor) pairs. The parameters of a module whose path matches the pattern, for example
             `encoder/images/backbone`, learn at `factor` times the rate, their weight decay included; `*` stands for any

@@ -111,7 +111,8 @@ def process_count() -> int:
 
 def is_first() -> bool:
     """Return whether this process reads and writes the run folder."""
-    # One that has joined no others is, and is not made to look for its devices: settings of JAX may still come.
+    # A process that joined no others is the first. JAX is not asked then: it would look for its devices, whose settings
+    # may still come.
     return not jax.distributed.is_initialized() or jax.process_index() == 0
 
 

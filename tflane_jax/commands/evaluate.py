@@ -83,8 +83,8 @@ def run(options: argparse.Namespace) -> int:
         print(f"\n{near.sentence()}")
     if trained.chosen and trained.config.chosen_by(source):
         print(
-            f"\nStep {trained.step} was chosen as the best one by these examples: its scores are too good by chance. "
-            "--checkpoint last was not chosen."
+            f"\nStep {trained.step} was chosen as the best one by these examples: its scores are too good by chance, "
+            "those of --checkpoint last are not."
         )
     paths += _save_edge_types(trained, source, stem)
     if options.errors:

@@ -88,7 +88,7 @@ def _trained(options: argparse.Namespace, overrides: Sequence[str]) -> int:
 def _agree_on_start(options: argparse.Namespace) -> None:
     """Raise UserError, in all processes, where one starts in another way than the first.
 
-    From then on, their ways of starting let processes wait for different things of one another, which would never come.
+    A process that reads --config exchanges other things next than one that resumes: each would wait for ever.
     """
     own = ["--config"] * (options.config is not None) + [f"--{options.start}"] * (options.start != "new")
     starts = processes.all_texts(" ".join(own))

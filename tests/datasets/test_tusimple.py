@@ -201,7 +201,7 @@ def test_a_damaged_image_ends_loading_with_its_name(root):
 @pytest.mark.parametrize("lanes", [np.zeros((0, 56)), np.full((2, 56), -2.0), np.zeros((0, 0))])
 def test_images_without_lanes(lanes):
     rows = ROWS[: lanes.shape[1]]
-    lines = lane_lines(RowLanes(lanes, rows), 720, 1280)
+    lines = lane_lines(RowLanes(lanes, rows), height=720, width=1280)
     assert not lines.valid.any()
     assert not lines.point_valid.any()
     assert row_lanes(lines).x.shape == (0, 56)
@@ -210,9 +210,9 @@ def test_images_without_lanes(lanes):
 def test_too_many_lines_leave_out_the_shortest():
     x = np.where(np.arange(56) < np.array([[30], [10], [50]]), [[300.0], [200.0], [100.0]], -2.0)
     with pytest.warns(TruncationWarning, match="an image has 3 lines and room for 2: raise `capacity`"):
-        lines = lane_lines(RowLanes(x, ROWS), 720, 1280, capacity=2)
+        lines = lane_lines(RowLanes(x, ROWS), height=720, width=1280, capacity=2)
     np.testing.assert_array_equal(lines.point_valid.sum(1), [50, 30])
-    assert lane_lines(RowLanes(x, ROWS), 720, 1280, capacity=3).valid.all()
+    assert lane_lines(RowLanes(x, ROWS), height=720, width=1280, capacity=3).valid.all()
 
 
 def test_other_rows_are_interpolated_where_labelled_on_both_sides():
@@ -220,7 +220,7 @@ def test_other_rows_are_interpolated_where_labelled_on_both_sides():
     rows = np.arange(300.0, 1080.0, 20.0)
     x = (rows * 2.0)[None].copy()
     x[0, 10] = -2  # a gap at row 500
-    lines = lane_lines(RowLanes(x[:, ::-1], rows[::-1]), 1080, 4000, capacity=1)
+    lines = lane_lines(RowLanes(x[:, ::-1], rows[::-1]), height=1080, width=4000, capacity=1)
     own = ROWS * 1.5
     inside = (own >= 300.0) & (own <= 1060.0) & ~((own > 480.0) & (own < 520.0))
     np.testing.assert_array_equal(lines.point_valid[0], inside)

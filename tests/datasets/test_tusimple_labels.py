@@ -39,6 +39,6 @@ def test_lines_are_sorted_by_their_first_points_and_reach_the_border():
     """One from 600 pixels down to the left border, where x is 0, and one from 500 pixels to the right."""
     left, right = np.linspace(660.0, 0.0, len(ROWS)), np.linspace(500.0, 900.0, len(ROWS))
     left[:5] = NO_POINT
-    lines = lane_lines(RowLanes(np.stack([left, right]), ROWS), 720, 1280, capacity=2)
+    lines = lane_lines(RowLanes(np.stack([left, right]), ROWS), height=720, width=1280, capacity=2)
     np.testing.assert_allclose(lines.points[:, -1, 0] * 1280, [900.0, 0.0], atol=1e-3)
     assert lines.point_valid[:, -1].all()

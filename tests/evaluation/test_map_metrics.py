@@ -116,6 +116,17 @@ def test_a_model_is_measured_on_its_classes(classes):
     assert found["recall"] == 1.0
 
 
+def test_a_frame_counts_in_its_group_given_as_to_all_accumulators():
+    """Regression: the third argument was `members`, so that a group of frames in its place was lost without a word."""
+    metrics = MapLineMetrics(labels=LABELS, frame_groups=("near", "far"))
+    for example, group in zip(world()[:2], ("near", "far"), strict=True):
+        metrics.update(perfect(example.map_lines), example, group)
+    lanes = {name: int(counts[:, 0].sum()) for name, counts in metrics.recalled().items()}
+    assert lanes["lines near"] > 0
+    assert lanes["lines far"] > 0
+    assert lanes["lines near"] + lanes["lines far"] == lanes["lines"]
+
+
 @pytest.mark.parametrize("labels", [(), ("visibility",)])
 def test_the_protocol_names_the_limit_of_groups_that_are_measured(labels):
     assert ("occluded" in MapLineMetrics(labels=labels).protocol) == ("visibility" in labels)

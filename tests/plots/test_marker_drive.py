@@ -3,11 +3,12 @@
 import numpy as np
 import pytest
 
+from tests.fakes import fake_segments
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.markers.detection import DetectedMarkers
-from tflane_jax.plots import marker_drive
+from tflane_jax.plots import cameras, marker_drive, style
 from tflane_jax.priors.marker_memory import MarkerGuidance
-from tflane_jax.scene import CameraViews
+from tflane_jax.scene import CameraViews, LineClass, LinePrediction
 
 pytest.importorskip("matplotlib")
 
@@ -103,3 +104,46 @@ def test_the_title_says_whether_there_are_lanes_and_from_where():
     titles = [marker_drive.frame_title(4, some, remembered=remembered) for remembered in (False, True)]
     assert titles == ["frame 4: lanes of a board in sight, c = 0.70", "frame 4: lanes from memory, c = 0.70"]
     assert marker_drive.frame_title(4, NO_LANES, remembered=False) == "frame 4: no lanes of a board"
+
+
+def frame_with(prediction, folder, monkeypatch):
+    """Return the figure of a frame with one board, and the lines that its camera shows, by colour."""
+    found = DetectedMarkers.empty(1)
+    found.valid[:], found.marker_id[:], found.size[:], found.pose[0, :2, 3] = True, 98, 1.0, (10.0, 2.0)
+    image, matrix = np.zeros((1, 48, 64, 3), np.uint8), np.eye(4, dtype=np.float32)[None]
+    views = CameraViews(image, np.array([[64, 48]]), np.eye(3)[None], matrix, np.ones(1, bool))
+    figures, shown = [], {}
+
+    def projected(ax, views, number, lines, *, colour, **_):
+        shown[colour] = np.asarray(lines)
+
+    monkeypatch.setattr(marker_drive, "save_figure", lambda figure, path: figures.append(figure))
+    monkeypatch.setattr(marker_drive, "draw_projected", projected)
+    monkeypatch.setattr(cameras, "draw_projected", projected)
+    marker_drive.save_drive_frame(
+        folder / "x.png", views, found, {98: "used"}, {98: 0.5}, NO_LANES, prediction, view=PerceptionRange()
+    )
+    return figures[0], shown
+
+
+def entries(figure):
+    return [text.get_text() for text in figure.legends[0].get_texts()]
+
+
+def test_a_crossing_is_no_lane_in_the_cameras(tmp_path, monkeypatch):
+    segments = fake_segments()
+    figure, shown = frame_with(segments, tmp_path, monkeypatch)
+    np.testing.assert_array_equal(shown[style.PREDICTION], segments.points[:2])
+    assert "predicted lane" in entries(figure)
+
+
+def test_lines_of_a_map_have_the_colours_of_their_classes(tmp_path, monkeypatch):
+    logits = np.full((3, 3), -9.0)
+    logits[0, LineClass.DIVIDER] = logits[1, LineClass.CROSSING] = 2.0
+    points = np.arange(24.0).reshape(3, 4, 2)
+    figure, shown = frame_with(LinePrediction(points, logits), tmp_path, monkeypatch)
+    for number, kind in enumerate((LineClass.DIVIDER, LineClass.CROSSING)):
+        np.testing.assert_array_equal(shown[style.MAP_LINE[kind]][0, :, :2], points[number])
+    assert len(shown[style.MAP_LINE[LineClass.BOUNDARY]]) == 0
+    assert "crossing" in entries(figure)
+    assert "predicted lane" not in entries(figure)

@@ -44,7 +44,7 @@ from tflane_jax.errors import UserError
 from tflane_jax.evaluation.interventions import NO_TRAFFIC
 from tflane_jax.files.wording import counted
 from tflane_jax.plots.figure import can_draw
-from tflane_jax.plots.tables import format_table, save_table
+from tflane_jax.plots.tables import PERCENT, POINTS, format_table, save_table
 from tflane_jax.progress import progress_bar
 from tflane_jax.runs import open_run
 from tflane_jax.tasks import Model
@@ -195,7 +195,7 @@ def _save(
     columns = [key for key in COLUMNS if all(key in found[row][log] for row in found for log in logs)]
     rows = compact({row: [by_log[log] for log in logs] for row, by_log in found.items()}, columns)
     title = f"{note}{protocol}; logs that were never seen, percent (mean ± std over {len(logs)} logs){ending}"
-    path, _ = save_table(out / "carry_over", rows, meta, title=title)
+    path, _ = save_table(out / "carry_over", rows, meta | {"unit": PERCENT}, title=title)
     table = format_table(rows, title=title)
     each: list[dict[str, Any]] = [
         {"log": log, "model": row} | {key: 100.0 * found[row][log][key] for key in columns}
@@ -203,12 +203,12 @@ def _save(
         for row in found
     ]
     over = "1 seed" if counts == [1] else f"mean over {number} seeds"
-    save_table(out / "logs", each, meta, title=f"{note}{protocol}, percent ({over}){ending}")
+    save_table(out / "logs", each, meta | {"unit": PERCENT}, title=f"{note}{protocol}, percent ({over}){ending}")
     tests = _tests(found, logs, declared)
     paired = f"Paired over {len(logs)} logs, points."
     once = _ONE_TRAINING if counts == [1] else ""
     title = " ".join(filter(None, [note.strip(), declared.sentence(), interim, paired, once, FITTED]))
-    save_table(out / "effects", tests, meta, title=title, digits=4)
+    save_table(out / "effects", tests, meta | {"unit": POINTS}, title=title, digits=4)
     print(f"\n{table}\n\n{format_table(tests, title=title, digits=4)}")
     return path
 

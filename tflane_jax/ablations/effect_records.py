@@ -8,9 +8,9 @@ measure, verdict, difference, low, high, p, better, seeds
                     of the primary measure, see `effects.Effect`; p is the corrected one
 further             the same for the other measures of the declaration
 
-Differences are fractions, or metres, as in `effects.json`. None stands for what does not exist: the measure of a claim
-without any result, p of one seed, an interval. Records that were made from the sentences of earlier summaries have
-rounded numbers, and "p below" in place of a p that those told as "< 0.0001".
+Differences are fractions, or metres, as in a table's `effects.json`. None stands for what does not exist: the measure
+of a claim without any result, p of one seed, an interval. Records that were made from the sentences of earlier
+summaries have rounded numbers, and "p below" in place of a p that those told as "< 0.0001".
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ from tflane_jax.ablations.report import listed
 from tflane_jax.ablations.results import Results
 from tflane_jax.evaluation.by_scene import SAMPLES as SHARED_SAMPLES
 from tflane_jax.metrics.directions import unit_of
-from tflane_jax.plots.tables import format_table, save_table
+from tflane_jax.plots.tables import FRACTIONS, format_table, save_table
 
 
 def save_effects(
@@ -45,6 +45,7 @@ def save_effects(
             lines.append(f"Remark: {no_drives}: the intervals are too narrow.")
     rows, title = _rows(results, declared.declaration, test, tested), "\n".join(lines)
     meta = {"declaration": asdict(declared), "protocol": results.protocol(test), "seeds": list(seeds)}
+    meta["unit"] = FRACTIONS
     path, _ = save_table(stem, rows, meta, title=title, digits=4)
     print("\n" + format_table(rows, title=title, digits=4))
     return path

@@ -12,7 +12,7 @@ from tflane_jax.ablations.results import Results
 from tflane_jax.ablations.scores import CHECKPOINTS, OWN_TEST
 from tflane_jax.files.atomic import write_json
 from tflane_jax.files.wording import counted
-from tflane_jax.plots.tables import format_table, save_table
+from tflane_jax.plots.tables import FRACTIONS, PERCENT, format_table, save_table
 from tflane_jax.tasks import Task
 
 
@@ -76,6 +76,7 @@ def _save_table(
     title = _with_warning(title, results, test)
     rows += task.quoted()
     meta = {"protocol": results.protocol(test), "seeds": list(results.seeds), "test": list(results.tests.get(test, ()))}
+    meta["unit"] = PERCENT
     written = save_table(stem, rows, meta, title=title)[0]
     print("\n" + format_table(rows, title=title))
     return written
@@ -103,9 +104,10 @@ def _save_paired(results: Results, test: str, metrics: Sequence[str], task: Task
     if not rows:
         return []
     over = "the seeds that both have" if any("seeds" in row for row in rows) else counted(len(results.seeds), "seed")
-    title = f"{results.protocol(test)}, {results.title(test)}: paired differences to {control}, two-sided t-test "
-    title = _with_warning(f"{title}over {over}; p (Holm) is corrected for all tests of one checkpoint", results, test)
-    meta = {"protocol": results.protocol(test), "seeds": seeds}
+    title = f"{results.protocol(test)}, {results.title(test)}: paired differences to {control} ({FRACTIONS}), "
+    title += f"two-sided t-test over {over}; p (Holm) is corrected for all tests of one checkpoint"
+    title = _with_warning(title, results, test)
+    meta = {"protocol": results.protocol(test), "seeds": seeds, "unit": FRACTIONS}
     written = save_table(stem, rows, meta, title=title, digits=4)[0]
     print("\n" + format_table(rows, title=title, digits=4))
     return [written]

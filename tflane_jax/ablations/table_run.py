@@ -59,7 +59,7 @@ from tflane_jax.files.atomic import write_json, write_text
 from tflane_jax.files.fields import load_json
 from tflane_jax.plots.curves import save_comparison_curves
 from tflane_jax.plots.figure import can_draw
-from tflane_jax.plots.tables import format_table, latex_table, latex_text, save_table
+from tflane_jax.plots.tables import PERCENT, format_table, latex_table, latex_text, save_table
 from tflane_jax.progress import progress_bar
 
 GEOMETRIC = ", geometric"
@@ -284,7 +284,7 @@ def _save_scores(table: PaperTable, results: Results, folder: Path, *, quick: bo
     if quick:
         title = f"SMOKE TEST, a few updates on a few scenes: no result. {title}"
     meta = {"table": table.name, "protocol": results.protocol(), "seeds": list(results.seeds), "quick": quick}
-    path, _ = save_table(folder / "table", rows, meta | {"quoted": asdict(table.quoted)}, title=title)
+    path, _ = save_table(folder / "table", rows, meta | {"quoted": asdict(table.quoted), "unit": PERCENT}, title=title)
     text, tex = path.read_text(encoding="utf-8"), latex_table(rows, caption=title)
     if table.note:
         text += f"\n{table.note}\n"

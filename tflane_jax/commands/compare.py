@@ -14,7 +14,11 @@ from tflane_jax.config_overrides import apply_overrides
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import check_folder
 from tflane_jax.limits import LARGEST_SEED
+from tflane_jax.training.notices import print_notices
 from tflane_jax.training.runtime import configure_jax
+
+# A single seed up to this may be meant as a number of seeds, as `tflane tables` takes it.
+_MOST_MEANT = 20
 
 
 def run(options: argparse.Namespace, overrides: Sequence[str]) -> int:
@@ -29,6 +33,9 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> int:
         raise UserError(f"--seeds {' '.join(map(str, options.seeds))}: the seeds must differ")
     if wrong := [seed for seed in options.seeds if not 0 <= seed <= LARGEST_SEED]:
         raise UserError(f"--seeds {wrong[0]}: a seed is a whole number from 0 to {LARGEST_SEED}")
+    if len(rows) > 1 and len(options.seeds) == 1 and (last := options.seeds[0]) > 0:
+        several = f"; for {last} seeds give --seeds {' '.join(map(str, range(last)))}" if last <= _MOST_MEANT else ""
+        print_notices([f"--seeds {last} is seed {last} alone, with which nothing can be tested{several}"])
     if options.jobs < 1:
         raise UserError(f"--jobs {options.jobs}: at least one training runs at a time")
     given = [*overrides, *(setting for _, _, settings in rows for setting in settings)]

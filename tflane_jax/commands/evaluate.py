@@ -21,7 +21,7 @@ from tflane_jax.evaluation.edge_types import weights_edge_types
 from tflane_jax.evaluation.interventions import with_traffic
 from tflane_jax.evaluation.lane_errors import lane_errors
 from tflane_jax.evaluation.predict import undivided_notices
-from tflane_jax.plots.tables import format_table, save_table, written_to
+from tflane_jax.plots.tables import FRACTIONS, PERCENT, format_table, save_table, written_to
 from tflane_jax.runs import Run, evaluate_run
 from tflane_jax.scene import stack_examples
 from tflane_jax.startup import showing, stage
@@ -73,6 +73,7 @@ def run(options: argparse.Namespace) -> int:
         "topology": evaluation.topology,
         "source": to_json(source),
         "near_training": None if near is None else near.sentence(),
+        "unit": FRACTIONS,
     }
     paths = list(save_table(stem, rows, meta, title=title))  # before anything is printed, which may fail
     print(format_table(rows, title=title))
@@ -110,7 +111,7 @@ def _save_errors(run: Run, task: Any, source: Any, stem: Path, meta: dict[str, A
             fractions = {outcome: 100.0 * number / every if every else 0.0 for outcome, number in counts.items()}
             rows.append({"of": name, "seed": seed, "number": every, "confidence": confidence} | fractions)
     title = "why lanes are not found, percent; detections with at least the confidence of the best F-score"
-    paths = list(save_table(stem.with_name(f"{stem.name}-errors"), rows, meta, title=title))
+    paths = list(save_table(stem.with_name(f"{stem.name}-errors"), rows, meta | {"unit": PERCENT}, title=title))
     print(f"\n{format_table(rows, title=title)}")
     return paths
 

@@ -6,14 +6,14 @@ frames.json:
      "boards": [{"id", "outcome", "score", "size", "position", "distance", "camera", "corners", "residual",
                  "confidence"}, ...],
      "guidance": [{"weight", "points": [[x, y], ...]}, ...],
-     "lanes": [{"score", "points": [[x, y, z], ...]}, ...]}, ...],
+     "lanes": [{"query", "score", "points": [[x, y, z], ...]}, ...]}, ...],
      "faults": [{"file", "error"}, ...]}
     "complete" is false if an error ended the command, and the frames are those before it.
     "lanes_dropped" counts lanes of the boards that the prior does not take. "outcome" is one of
-    `markers.observe.Outcome`; "residual" and "confidence" exist for boards that give a prior, "lanes" with a model. An
-    id that was read at two places has two entries. Coordinates are in the ego frame, metres; corners of the black
-    square are pixels of the camera's undistorted image. `faults` are images that could not be read; their cameras saw
-    nothing in that frame.
+    `markers.observe.Outcome`; "residual" and "confidence" exist for boards that give a prior. "lanes" exist with a
+    model, as in predictions.json (`commands.predict_lanes`). An id that was read at two places has two entries.
+    Coordinates are in the ego frame, metres; corners of the black square are pixels of the camera's undistorted image.
+    `faults` are images that could not be read; their cameras saw nothing in that frame.
 """
 
 from __future__ import annotations
@@ -51,6 +51,7 @@ from tflane_jax.progress import progress_bar
 from tflane_jax.runs import open_run
 from tflane_jax.scene import CameraViews
 from tflane_jax.scene.marker_patterns import MarkerFamily, marker_count
+from tflane_jax.tasks.answers import answer_arrays, best_first, lane_records
 from tflane_jax.tasks.marker_drive import DriveModel, DriveStep, MarkerDrive, as_trained, check_model, check_rate
 from tflane_jax.training.runtime import configure_jax
 
@@ -289,10 +290,6 @@ def _record(step: DriveStep, views: CameraViews, names: Sequence[str], threshold
         "guidance": lanes,
     }
     if step.prediction is not None:
-        found = step.prediction.lanes
-        scores = 1.0 / (1.0 + np.exp(-np.asarray(found.logits, np.float64).max(-1)))
-        best = [q for q in np.argsort(-scores, kind="stable") if scores[q] >= threshold]
-        record["lanes"] = [
-            {"score": round(float(scores[q]), 4), "points": np.asarray(found.points[q]).round(3).tolist()} for q in best
-        ]
+        arrays = {name: np.asarray(array) for name, array in answer_arrays(step.prediction).items()}
+        record["lanes"] = lane_records(arrays, best_first(arrays["scores"], threshold))
     return record

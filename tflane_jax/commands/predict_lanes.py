@@ -21,7 +21,7 @@ predictions.json, lanes with a score of at least `threshold`, best first:
      "elements": [{"query", "score", "attribute", "box": [[left, top], [right, bottom]]}, ...],
      "governs": [{"element": position in elements, "lane": position in lanes, "score"}, ...]}, ...]}
     Lane segments add "left", "right", "category" and, with line types, "left_type" and "right_type"; lines add
-    "category".
+    "category". A line has its best class here, where pictures and scores take every pair of query and class.
     Relations have a score of at least 0.5. "elements" and "governs" exist if the model predicts traffic elements.
 """
 
@@ -33,7 +33,7 @@ from typing import Any, cast
 
 import jax
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from tflane_jax.commands.sources import limited_task, make_folder, model_title, source_for
 from tflane_jax.commands.views import with_images
@@ -53,13 +53,12 @@ from tflane_jax.plots.figure import can_draw
 from tflane_jax.plots.segments import true_lanes
 from tflane_jax.runs import Run
 from tflane_jax.scene import Example, LanePrediction, LinePrediction, Prediction
-from tflane_jax.tasks.answers import answer_arrays
+from tflane_jax.tasks.answers import answer_arrays, best_first, lane_records
 from tflane_jax.tasks.lane_pictures import titles
 
 _RELATION_THRESHOLD = 0.5
 MOST_DRAWN = 16
 """Frames in a picture, spread evenly over those that are predicted: a picture of a whole split cannot be drawn."""
-_OF_SEGMENTS = ("left", "right", "category", "left_type", "right_type")
 
 
 def predict(trained: Run, options: argparse.Namespace) -> int:
@@ -159,23 +158,18 @@ def _truth(examples: Example, lanes: LanePrediction, arrays: dict[str, np.ndarra
 
 def _frame(info: FrameInfo, arrays: dict[str, np.ndarray], threshold: float) -> dict[str, Any]:
     """Return one frame as plain values; `arrays` are those of predictions.npz for this frame."""
-    scores, points = arrays["scores"], arrays["points"]
-    kept = _best_first(scores, threshold)
+    kept = best_first(arrays["scores"], threshold)
     frame: dict[str, Any] = {
         "source": info.source,
         "scene": info.scene,
         "timestamp_ns": int(info.timestamp_ns),
-        "lanes": [
-            {"query": int(q), "score": float(scores[q]), "points": points[q].tolist()}
-            | {name: arrays[name][q].tolist() for name in _OF_SEGMENTS if name in arrays}
-            for q in kept
-        ],
+        "lanes": lane_records(arrays, kept),
     }
     if "successor" in arrays:
         frame["successors"] = _relations(arrays["successor"][np.ix_(kept, kept)], "from", "to")
     if "box" in arrays:
         best = arrays["attribute_score"].max(-1)
-        shown = _best_first(best, threshold)
+        shown = best_first(best, threshold)
         frame["elements"] = [
             {
                 "query": int(e),
@@ -187,11 +181,6 @@ def _frame(info: FrameInfo, arrays: dict[str, np.ndarray], threshold: float) -> 
         ]
         frame["governs"] = _relations(arrays["element_lane"][np.ix_(kept, shown)].T, "element", "lane")
     return frame
-
-
-def _best_first(scores: Float[np.ndarray, " q"], threshold: float) -> Int[np.ndarray, " k"]:
-    order = np.argsort(-scores, kind="stable")
-    return order[scores[order] >= threshold]
 
 
 def _relations(scores: Float[np.ndarray, "a b"], first: str, second: str) -> list[dict[str, Any]]:

@@ -1,7 +1,7 @@
 """`tflane predict` for lane lines in photos and videos of any size and camera.
 
 predictions.json, and one picture or video (MP4) for each input:
-    {"model", "step", "threshold", "complete",
+    {"run", "step", "threshold", "complete",
      "photos": [{"file", "width", "height", "picture", "view", "value", "needed", "warning", "lanes": LANES}, ...],
      "videos": [{"file", "width", "height", "rate", "video", "view", "warning", "frames": [LANES, ...]}, ...],
      "faults": [{"file", "error"}, ...]}
@@ -65,7 +65,7 @@ def predict(trained: Run, paths: list[Path], options: argparse.Namespace) -> int
     camera = None if options.focal is None and options.horizon is None else PhotoCamera(options.focal, options.horizon)
     reader = PhotoReader(trained.config.task, trained.params[0], options.threshold)
     make_folder(options.out)
-    head = {"model": trained.name, "step": trained.step, "threshold": options.threshold}
+    head = {"run": trained.name, "step": trained.step, "threshold": options.threshold}
     report = _Report(options.out / "predictions.json", head)
     try:
         for path in progress_bar(photos, desc="predict", unit="photo", disable=not photos):

@@ -156,7 +156,7 @@ def thinned(drive: Drive, interval: float) -> Drive:
     return Drive(drive.cameras, tuple(drive.frames[i] for i in kept))
 
 
-def load_drive(path: Path, images: Path) -> Drive:
+def load_drive(path: Path | str, images: Path | str) -> Drive:
     """Read and check a drive.
 
     Args:
@@ -165,6 +165,7 @@ def load_drive(path: Path, images: Path) -> Drive:
 
     Raises UserError that names file, place and fault; a file name that leads out of the folder is one.
     """
+    path, images = Path(path), Path(images)
     record, where = load_json(path), str(path)
     if member(record, "format", where) != FORMAT:
         raise UserError(f"{where}: format is {shown(record['format'])}, expected {FORMAT!r}: this is no drive")

@@ -33,7 +33,7 @@ class LabelledImages:
     truth: Sequence[RowLanes]
 
 
-def lane_lines(truth: RowLanes, height: int, width: int, *, capacity: int = 8) -> LaneLines:
+def lane_lines(truth: RowLanes, *, height: int, width: int, capacity: int = 8) -> LaneLines:
     """Return labels as lines with points at `ROWS`, sorted from left to right by each line's first point.
 
     Labels at other rows, or of images of another height, are interpolated between neighbouring labelled rows. Lanes

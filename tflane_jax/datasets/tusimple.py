@@ -122,7 +122,7 @@ class TuSimpleDataset:
         image = read_image(folder / name)
         height, width = self._sizes[name] = image.shape[:2]
         image = resize(image, self.config.height, self.config.width)
-        lines = lane_lines(truth, height, width, capacity=self.config.capacity)
+        lines = lane_lines(truth, height=height, width=width, capacity=self.config.capacity)
         return RoadImage(image, np.ones(image.shape[:2], bool), lines)
 
     def truth(self, index: int) -> RowLanes:

@@ -131,7 +131,7 @@ class LaneGraphMetrics:
             self._segments.add(frame, segments, frame_group, members.get("segments"))
             self._devkit.add(frame)
         if prediction.lines is not None:
-            self._lines.update(prediction.lines, example, members.get("lines"), frame_group)
+            self._lines.update(prediction.lines, example, frame_group, members.get("lines"))
 
     def compute(self) -> dict[str, dict[str, float]]:
         """Return metrics by name, for every group of every protocol that applies."""

@@ -69,16 +69,16 @@ class MapLineMetrics:
         self,
         lines: LinePrediction,
         example: Example,
-        members: Mapping[str, Bool[np.ndarray, " g"]] | None = None,
         frame_group: FrameGroup = None,
+        members: Mapping[str, Bool[np.ndarray, " g"]] | None = None,
     ) -> None:
         """Add one frame.
 
         Args:
             lines: the last decoder layer's prediction.
             example: with labelled lines; without, they are derived from its lane segments and areas.
-            members: for each of the further groups, which of the measured true lines belong to it.
             frame_group: the groups that this frame belongs to.
+            members: for each of the further groups, which of the measured true lines belong to it.
         """
         lines = replace(lines, points=lines.points[..., : self._dims])
         detections = detections_of_lines(lines)

@@ -56,7 +56,9 @@ class PolylineEncoderConfig:
     Attributes:
         dim: channels of a token.
         layers, heads, hidden, dropout: sizes and dropout of the transformer.
-        bands, temperature, layout: of the encoding of points; 0 bands leave their coordinates as they are.
+        bands: channels of each coordinate of a point, half of them sines and half cosines; 0 leaves coordinates as
+            they are.
+        temperature, layout: of the encoding of points.
         attend: what attends to each other: "lines" (SMERF), or the "points" of one line (marker fusion).
     """
 

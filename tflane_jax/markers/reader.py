@@ -27,6 +27,9 @@ from tflane_jax.scene import CameraViews
 class ReaderConfig:
     """Settings of a reader.
 
+    `tflane markers run` reads with today's date, and searches partly hidden boards by the ids of the store:
+    `ReaderConfig(DetectorConfig(search="all", ids=tuple(store.markers)), today=datetime.date.today())`.
+
     Attributes:
         detector: how images are searched; the store's sizes replace its own.
         range: lanes are cut at this box, metres.

@@ -76,9 +76,9 @@ def _in_frame(marker: StoredMarker, frame: Literal["marker", "survey"]) -> Float
     return transform_points(marker.global_from_marker, marker.lanes.reshape(-1, 3)).reshape(marker.lanes.shape)
 
 
-def load_store(path: Path) -> MarkerStore:
+def load_store(path: Path | str) -> MarkerStore:
     """Read a store and check all of it; raises one UserError that names the file, the marker and the field."""
-    return _store_of(parse_json(read_text(path), str(path), once=True), str(path))
+    return _store_of(parse_json(read_text(Path(path)), str(path), once=True), str(path))
 
 
 def _store_of(record: Any, where: str) -> MarkerStore:

@@ -182,12 +182,12 @@ def draw_camera(
             known = np.asarray(example.map_lines.points)[np.asarray(example.map_lines.valid)]
             draw_projected(ax, views, number, known, colour="white", width=0.6)
         points, category, _ = chosen_lines(lanes, threshold)
-        _draw_by_class(ax, views, number, points, category)
+        draw_projected_by_class(ax, views, number, points, category)
     elif lanes is not None:
         draw_projected(ax, views, number, np.asarray(lanes.points)[np.asarray(lanes.scores) >= threshold])
     elif not predicted and example.map_lines is not None:
         points, category = valid_rows(example.map_lines.valid, example.map_lines.points, example.map_lines.category)
-        _draw_by_class(ax, views, number, points, category)
+        draw_projected_by_class(ax, views, number, points, category)
     elif not predicted:
         draw_projected(ax, views, number, np.asarray(example.lanes.points)[np.asarray(example.lanes.valid)])
     if number == 0 and elements is not None:
@@ -265,9 +265,10 @@ def _draw_segments(ax: Axes, views: CameraViews, number: int, found: SegmentPred
     draw_projected(ax, views, number, kerbs, colour=style.ROAD_BOUNDARY, width=1.5)
 
 
-def _draw_by_class(
+def draw_projected_by_class(
     ax: Axes, views: CameraViews, number: int, points: Float[np.ndarray, "n p 3"], category: Int[np.ndarray, " n"]
 ) -> None:
+    """Draw lines of a vector map into a camera's image, in the colours of their classes."""
     for kind, colour in style.MAP_LINE.items():
         width = 0.8 if kind == LineClass.CENTERLINE else 1.5
         draw_projected(ax, views, number, points[category == kind], colour=colour, width=width)

@@ -16,12 +16,14 @@ from tflane_jax.markers.observe import Outcome
 from tflane_jax.markers.square_pose import marker_outline
 from tflane_jax.plots import style
 from tflane_jax.plots.bev import draw_ego, draw_prediction, prepare
-from tflane_jax.plots.cameras import draw_projected
+from tflane_jax.plots.cameras import draw_projected, draw_projected_by_class
 from tflane_jax.plots.figure import new_figure, save_figure
 from tflane_jax.plots.images import draw_image
 from tflane_jax.plots.lines import add_arrows, add_lines
+from tflane_jax.plots.map_lines import chosen_lines, class_entries
+from tflane_jax.plots.segments import chosen_segments
 from tflane_jax.priors.marker_memory import MarkerGuidance
-from tflane_jax.scene import CameraViews, LanePrediction
+from tflane_jax.scene import CameraViews, LanePrediction, LinePrediction, SegmentPrediction
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -79,16 +81,17 @@ def save_drive_frame(
         threshold: lowest score of predicted lanes.
     """
     shown = _cameras(views, detected)
-    found = None
-    if prediction is not None:
-        found = np.asarray(prediction.points)[np.asarray(prediction.scores) >= threshold]
+    found, category = (None, None) if prediction is None else _found(prediction, threshold)
     figure, axes = new_figure(1, len(shown) + 1, panel=(4.4, 3.6), footer=0.3)
     for number, ax in zip(shown, axes[0], strict=False):
         name = names[number] if names else f"camera {number}"
         draw_boards(ax, views, number, detected, outcomes, confidence, guidance, title=name)
-        if found is not None and found.shape[-1] == 3:
+        if found is not None:
             small = _at_scale(views, _factor(views, number))
-            draw_projected(ax, small, number, found, colour=style.PREDICTION, width=0.9)
+            if category is not None:
+                draw_projected_by_class(ax, small, number, found, category)
+            else:
+                draw_projected(ax, small, number, found, colour=style.PREDICTION, width=0.9)
     above: Any = axes[0, -1]
     prepare(above, view, title)
     above.set_xlabel("x, forward [m]", fontsize=8)
@@ -118,9 +121,7 @@ def save_drive_frame(
                 zorder=6.3,  # above the ego vehicle
             )
     draw_ego(above)
-    figure.legend(
-        handles=_entries(prediction is not None), loc="outside lower center", ncols=5, fontsize=7, frameon=False
-    )
+    figure.legend(handles=_entries(prediction), loc="outside lower center", ncols=5, fontsize=7, frameon=False)
     return save_figure(figure, path)
 
 
@@ -132,16 +133,30 @@ def frame_title(number: int, guidance: MarkerGuidance, *, remembered: bool) -> s
     return f"frame {number}: lanes {where}, c = {float(guidance.gate):.2f}"
 
 
-def _entries(predicted: bool) -> list[Any]:
+def _found(
+    prediction: LanePrediction, threshold: float
+) -> tuple[Float[np.ndarray, "n p 3"], Int[np.ndarray, " n"] | None]:
+    """Return the lanes that cameras show: centerlines, those of segments that are lanes, or map lines and classes."""
+    if isinstance(prediction, LinePrediction):
+        points, category, _ = chosen_lines(prediction, threshold)
+        return points, category
+    shown = np.asarray(prediction.scores) >= threshold
+    if isinstance(prediction, SegmentPrediction):
+        shown, _ = chosen_segments(prediction, threshold)
+    return np.asarray(prediction.points)[shown], None
+
+
+def _entries(prediction: LanePrediction | None) -> list[Any]:
     from matplotlib.lines import Line2D
 
     doubted, trusted = lane_colours(np.array([0.0, 1.0]))
-    lanes = {"lane of a board, c = 1": trusted, "c = 0": doubted} | (
-        {"predicted lane": style.PREDICTION} if predicted else {}
-    )
+    lanes = {"lane of a board, c = 1": trusted, "c = 0": doubted}
+    if prediction is not None and not isinstance(prediction, LinePrediction):
+        lanes["predicted lane"] = style.PREDICTION
     return [
         Line2D([], [], color=OUTCOMES["used"], lw=0, marker="s", ms=5, label="board, its id and c"),
         *(Line2D([], [], color=colour, lw=2, label=label) for label, colour in lanes.items()),
+        *(class_entries() if isinstance(prediction, LinePrediction) else ()),
     ]
 
 

@@ -14,6 +14,9 @@ from tflane_jax.files.atomic import check_stem, write_text
 
 Row = Mapping[str, Any]
 
+# What numbers of scores are, for the "unit" of a table's "meta".
+FRACTIONS, PERCENT, POINTS = "fractions; distances in metres", "percent; distances in metres", "points"
+
 
 def format_table(rows: Sequence[Row], columns: Sequence[str] | None = None, *, title: str = "", digits: int = 3) -> str:
     """Return the rows as an aligned Markdown table; columns of numbers are right-aligned.

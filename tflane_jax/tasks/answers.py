@@ -1,4 +1,4 @@
-"""A prediction as arrays by name: what `tflane predict` writes, and what an exported program returns."""
+"""A prediction as arrays by name and as plain values: what commands write, and what an exported program returns."""
 
 from __future__ import annotations
 
@@ -7,9 +7,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float, Int
 from scipy.special import expit
 
 from tflane_jax.scene import LinePrediction, Prediction, SegmentPrediction
+
+# Arrays of a lane that only models of segments, or of a vector map, have.
+_OF_KIND = ("left", "right", "category", "left_type", "right_type")
 
 
 def answer_arrays(prediction: Prediction) -> dict[str, Any]:
@@ -36,3 +40,19 @@ def answer_arrays(prediction: Prediction) -> dict[str, Any]:
         if elements.lane_logits is not None:
             arrays["element_lane"] = sigmoid(elements.lane_logits)
     return arrays
+
+
+def best_first(scores: Float[np.ndarray, " q"], threshold: float) -> Int[np.ndarray, " k"]:
+    """Return the numbers of the queries with a score of at least `threshold`, best first."""
+    order = np.argsort(-scores, kind="stable")
+    return order[scores[order] >= threshold]
+
+
+def lane_records(arrays: dict[str, np.ndarray], queries: Int[np.ndarray, " k"]) -> list[dict[str, Any]]:
+    """Return lanes of one frame (`arrays` without leading axes) as the "lanes" of predictions.json."""
+    kinds = [name for name in _OF_KIND if name in arrays]
+    return [
+        {"query": q, "score": float(arrays["scores"][q]), "points": arrays["points"][q].tolist()}
+        | {name: arrays[name][q].tolist() for name in kinds}
+        for q in queries.tolist()
+    ]

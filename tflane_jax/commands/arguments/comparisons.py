@@ -38,7 +38,7 @@ def _seeds(text: str) -> Sequence[int]:
     listed = [range(int(ends[0]), int(ends[-1]) + 1) for ends in bounds]
     ranges = [range(int(text))] if bounds == [[text]] else listed
     if not all(map(len, ranges)) or sum(map(len, ranges)) > _MOST_SEEDS:
-        raise argparse.ArgumentTypeError(f"{text}: at least one, at most {_MOST_SEEDS}")
+        raise argparse.ArgumentTypeError(f"{text}: at least one, at most {_MOST_SEEDS}; a list is 0,1,2")
     return sorted({seed for each in ranges for seed in each})
 
 
@@ -59,7 +59,9 @@ def compare(commands) -> None:
         help="config files; the others are compared with the first one. One argument may also hold settings of this "
         "row, such as 'NAME=FILE --optim.lr 1e-3'",
     )
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4], help="default 0 1 2 3 4")
+    parser.add_argument(
+        "--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4], help="the seeds, not their number (default 0 1 2 3 4)"
+    )
     parser.add_argument(
         "--jobs", type=int, default=1, help="number of trainings at a time, which share the cores (default 1)"
     )

@@ -24,9 +24,11 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.timing import command_line, machine, markdown_table, save
+from tflane_jax.cli import exit_code
 from tflane_jax.cli import main as tflane
 from tflane_jax.config import NuScenesData, OpenLaneV2Data, RunConfig, WorldData, load_config
 from tflane_jax.config_overrides import apply_overrides
+from tflane_jax.errors import UserError
 from tflane_jax.models.bev_encoder import BevFormerConfig
 from tflane_jax.models.camera_encoder import CameraEncoderConfig
 from tflane_jax.runs import train_run
@@ -46,6 +48,8 @@ CONFIGS = (
 )
 UPDATES = 3
 _MEASURED = "measured: "
+# Of this process, on Linux.
+_STATUS = Path("/proc/self/status")
 
 
 def measurable(name: str) -> RunConfig:
@@ -112,7 +116,7 @@ def train(name: str, folder: Path) -> dict[str, Any]:
 
 def _peak_gib() -> float:
     """Return the most memory that this process has held; `ru_maxrss` would begin with that of the one it came from."""
-    status = Path("/proc/self/status").read_text(encoding="utf-8")
+    status = _STATUS.read_text(encoding="utf-8")
     return int(next(line.split()[1] for line in status.splitlines() if line.startswith("VmHWM"))) / 2**20
 
 
@@ -129,6 +133,8 @@ def measured(name: str, folder: Path) -> dict[str, Any]:
 
 def run(out: Path, names: Sequence[str] = CONFIGS) -> dict[str, Any]:
     """Measure the configurations; after each, print the table and write `paper_sizes.json` and `.md` into `out`."""
+    if not _STATUS.exists():
+        raise UserError(f"the memory of a training is read from {_STATUS}, which this system does not have")
     folder = out / "paper_sizes"
     if any(isinstance(load_config(name).data, OpenLaneV2Data) for name in names):
         written = ["--out", str(folder / "openlane_v2"), "--tracks", str(folder / "argoverse2")]
@@ -167,4 +173,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(exit_code(main))

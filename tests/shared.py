@@ -23,6 +23,14 @@ def shared_path(relative: str) -> Path:
     return path
 
 
+def rename(path: Path, name: str) -> Path:
+    """Give a file a name that is not UTF-8; skip the calling test where the file system has none (APFS)."""
+    try:
+        return path.rename(path.with_name(name))
+    except OSError as error:
+        pytest.skip(f"names of files are UTF-8 here: {error}")
+
+
 def assert_same(one, other):
     """Assert that the leaves of two trees are exactly equal; NaN equals NaN."""
     jax.tree.map(np.testing.assert_array_equal, one, other)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from tests.markers.test_detection import AHEAD, photo, pose
+from tests.shared import rename
 from tflane_jax.cli import main
 from tflane_jax.commands.markers import _label_place
 from tflane_jax.errors import LeftOutWarning
@@ -82,7 +83,7 @@ def test_a_photo_too_long_for_opencv_is_a_fault(photos, tmp_path, capsys):
 
 
 def test_a_photo_whose_name_is_not_utf8_is_a_fault(photos, tmp_path, capsys):
-    (photos / "a.png").rename(photos / "K\udcfcste.png")
+    rename(photos / "a.png", "K\udcfcste.png")
     assert main(["markers", "detect", str(photos), *INTRINSICS, "--out", str(tmp_path / "out")]) == 2
     assert "the name is not UTF-8; rename the file" in capsys.readouterr().err
     written = json.loads((tmp_path / "out" / "detections.json").read_text())

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from tests.shared import rename
 from tflane_jax.commands import predict as predict_command
 from tflane_jax.commands import predict_photos, sources
 from tflane_jax.datasets.photos import fit_photo
@@ -114,7 +115,7 @@ def test_no_photo_is_replaced_by_a_picture(predict, tmp_path):
 def test_a_photo_whose_name_is_not_utf8_stops_no_other(predict, tmp_path, capsys):
     photo(tmp_path / "a.png")
     photo(tmp_path / "b.png")
-    (tmp_path / "b.png").rename(tmp_path / "lat\udce9.png")
+    rename(tmp_path / "b.png", "lat\udce9.png")
     assert predict(".") == 2
     assert "lat\\udce9.png': the name is not UTF-8; rename the file" in capsys.readouterr().err
     written = report(tmp_path)

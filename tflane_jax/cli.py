@@ -87,6 +87,8 @@ def _check_filled(arguments: Sequence[str]) -> None:
         if not argument or re.fullmatch("--[^=]+=", argument):
             place = f"{argument.removesuffix('=')} has an empty value" if argument else f"an empty word after {before}"
             raise UserError(f"{place}: is a variable of the shell not set?")
+        if argument == "#":
+            raise UserError("# is no comment for this shell: leave out what follows it, or `setopt interactive_comments`")
 
 
 def exit_code(run: Callable[[], int]) -> int:
@@ -109,7 +111,7 @@ def exit_code(run: Callable[[], int]) -> int:
         return 2
     except BrokenPipeError:  # `tflane ... | head`
         _drop_output(sys.stdout)
-        return 128 + signal.SIGPIPE
+        return 128 + getattr(signal, "SIGPIPE", 13)  # Windows has none
     except RuntimeError as error:
         # By name, because importing JAX is slow. Other libraries say the same of a full disk.
         if type(error).__name__ != "JaxRuntimeError" or "RESOURCE_EXHAUSTED" not in str(error):

@@ -12,13 +12,13 @@ from tflane_jax.training.provenance import thread_setting
 
 @pytest.fixture(autouse=True)
 def _four_cores(monkeypatch, tmp_path):
-    monkeypatch.setattr("os.sched_getaffinity", lambda _: set(range(10, 14)))
+    monkeypatch.setattr("os.sched_getaffinity", lambda _: set(range(10, 14)), raising=False)
     monkeypatch.setattr("tempfile.gettempdir", lambda: str(tmp_path))
 
 
 @pytest.mark.parametrize(("available", "parallel", "each"), [(8, 2, 4), (3, 2, 1), (2, 5, 1), (4, 1, 4)])
 def test_all_workers_have_the_same_number_of_cores(monkeypatch, available, parallel, each):
-    monkeypatch.setattr("os.sched_getaffinity", lambda _: set(range(10, 10 + available)))
+    monkeypatch.setattr("os.sched_getaffinity", lambda _: set(range(10, 10 + available)), raising=False)
     assert cores_each(parallel) == each
     assert worker_threads(parallel) == thread_setting(each)
     with cores_of_workers(parallel, each) as cores:

@@ -1,6 +1,7 @@
 """Caches: damaged entries, wrong folders, scripts without a guard; listing and clearing."""
 
 import contextlib
+import errno
 import json
 import multiprocessing
 import os
@@ -177,4 +178,16 @@ def test_a_wrong_cache_folder_is_named(tmp_path, named, monkeypatch):
     (tmp_path / "file").touch()
     monkeypatch.setenv("TFLANE_CACHE", named.format(file=tmp_path / "file"))
     with pytest.raises(UserError, match="TFLANE_CACHE"):
+        cache.cached(FakeDataset(FakeConfig()), workers=1, progress=False)
+
+
+def test_a_read_only_home_without_a_folder_for_caches_is_named(tmp_path, monkeypatch):
+    """Regression: a folder above the cache could not be made, which ended in a traceback."""
+
+    def read_only(self, *arguments, **options):
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(tmp_path / "home"))
+
+    monkeypatch.setenv("TFLANE_CACHE", str(tmp_path / "home" / ".cache" / "tflane"))
+    monkeypatch.setattr(Path, "mkdir", read_only)
+    with pytest.raises(UserError, match=r"home/\.cache.*: Read-only file system; set TFLANE_CACHE to a folder"):
         cache.cached(FakeDataset(FakeConfig()), workers=1, progress=False)

@@ -32,7 +32,10 @@ def cores_each(parallel: int, cores: int | None = None) -> int:
     """
     if not hasattr(os, "sched_getaffinity"):
         if cores is not None:
-            raise UserError(f"--cores {cores}: this system does not tell a process which cores to use")
+            raise UserError(
+                f"--cores {cores}: this system does not tell a process which cores to use; leave it out: recorded runs "
+                "are taken whatever their cores were"
+            )
         return 0
     every = len(os.sched_getaffinity(0))
     if cores is not None and not 1 <= cores <= every:

@@ -315,7 +315,8 @@ def _train_jobs(pipe: Any, cores: list[int], accelerator: Mapping[str, str]) -> 
     try:
         while (job := _next(pipe)) is not None:
             failures: list[Failure] = []
-            with job.log.open("a") as log, contextlib.redirect_stdout(log), contextlib.redirect_stderr(log):
+            log = job.log.open("a", encoding="utf-8", errors="backslashreplace")
+            with log, contextlib.redirect_stdout(log), contextlib.redirect_stderr(log):
                 configure_jax()
                 with noted(job, failures), showing(begin):
                     if not job.is_complete():

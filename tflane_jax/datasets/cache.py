@@ -298,15 +298,17 @@ def _only_builder(folder: Path) -> Iterator[bool]:
         yield alone
 
 
-def _is_below(name: Any, root: Path) -> bool:
-    return Path(os.fsdecode(name)).absolute().is_relative_to(root.absolute())
+def _on_the_way(name: Any, root: Path) -> bool:
+    """Return whether a path is `root`, below it, or a folder above it, which is made before it."""
+    path, root = Path(os.fsdecode(name)).absolute(), root.absolute()
+    return path.is_relative_to(root) or root.is_relative_to(path)
 
 
 def _explain(error: OSError, root: Path) -> Exception:
     """Return a UserError with a remedy for a failure to write below `root`; return any other error unchanged."""
     if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
         remedy = "free space there, ask for fewer scenes, or set TFLANE_CACHE to a folder on another disk"
-    elif error.errno in _UNUSABLE and (error.filename is None or _is_below(error.filename, root)):
+    elif error.errno in _UNUSABLE and (error.filename is None or _on_the_way(error.filename, root)):
         remedy = "set TFLANE_CACHE to a folder that can be written"
     else:
         return error

@@ -165,8 +165,9 @@ class Streamed:
                 raise
             raise UserError(
                 f"{self.dataset.name}: a process that loads examples died: either memory ran out (set fewer "
-                "data.loading.processes, or 0), or a script started the training outside "
-                '`if __name__ == "__main__":` (these processes import the script)'
+                "data.loading.processes, or 0), or /dev/shm is full, which containers often limit to 64 MB (docker run "
+                '--shm-size 2g), or a script started the training outside `if __name__ == "__main__":` (these '
+                "processes import the script)"
             ) from error
         finally:
             iterator.close()

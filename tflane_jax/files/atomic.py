@@ -128,7 +128,7 @@ def rename_flushed(written: Path, path: Path) -> None:
 def _flush_one(path: Path) -> None:
     if path.is_dir() and os.name != "posix":  # elsewhere, folders cannot be opened
         return
-    handle = os.open(path, os.O_RDONLY)
+    handle = os.open(path, os.O_RDONLY if os.name == "posix" else os.O_RDWR)  # Windows flushes what it may write
     try:
         os.fsync(handle)
     finally:

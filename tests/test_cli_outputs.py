@@ -75,6 +75,7 @@ def test_data_that_are_read_are_not_replaced(tmp_path, capsys):
         (["eval", ""], "an empty word after eval"),
         (["sweep", "=runs/a", "--setting", "data.test", "--values", "1"], "=runs/a: the name before = is empty"),
         (["compare", "=a.py"], "=a.py: the name before = is empty"),
+        (["tables", "#", "lists", "them"], "this shell reads # as a word"),
         (
             ["compare", "a.py", "b.py", "--seeds", "3"],
             "--seeds 3 is seed 3 alone, with which nothing can be tested; for 3 seeds give --seeds 0 1 2",

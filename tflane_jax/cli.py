@@ -88,7 +88,9 @@ def _check_filled(arguments: Sequence[str]) -> None:
             place = f"{argument.removesuffix('=')} has an empty value" if argument else f"an empty word after {before}"
             raise UserError(f"{place}: is a variable of the shell not set?")
         if argument == "#":
-            raise UserError("# is no comment for this shell: leave out what follows it, or `setopt interactive_comments`")
+            raise UserError(
+                "this shell reads # as a word: leave out the comment, or `setopt interactive_comments` before"
+            )
 
 
 def exit_code(run: Callable[[], int]) -> int:

@@ -164,10 +164,10 @@ def test_a_map_is_prepared_once_and_forgotten_with_it():
     first = prepare_map(vector_map, bike_lanes=True)
     assert prepare_map(vector_map, bike_lanes=True) is first
     key = (id(vector_map), True)
-    assert key in prepared_map._PREPARED
+    assert key in prepared_map._PREPARED._kept
     del vector_map
     gc.collect()
-    assert key not in prepared_map._PREPARED
+    assert key not in prepared_map._PREPARED._kept
 
 
 def areas_of(*, crossings=(), boundaries=(), capacity=6, form="ring"):

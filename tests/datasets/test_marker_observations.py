@@ -29,7 +29,7 @@ def test_threads_that_stream_frames_share_a_store(monkeypatch):
         return store_of_log(*arguments, **named)
 
     monkeypatch.setattr(marker_observations, "store_of_log", slow)
-    before = set(marker_observations._REMEMBERED)
+    before = set(marker_observations._REMEMBERED._kept)
 
     def read(frame):
         marker_observations.marker_observations(drive, frame, MarkerConfig(), PerceptionRange(), bike_lanes=True)
@@ -42,4 +42,4 @@ def test_threads_that_stream_frames_share_a_store(monkeypatch):
     assert len(made) == 1
     del drive, threads, read
     gc.collect()
-    assert set(marker_observations._REMEMBERED) <= before
+    assert set(marker_observations._REMEMBERED._kept) <= before

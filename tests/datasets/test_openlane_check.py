@@ -47,7 +47,7 @@ def change(path, function):
 def test_a_whole_folder_is_counted(whole):
     found = check_openlane_v2(whole, progress=False)
     assert found.faults == []
-    assert found.subset == "B"
+    assert found.format == "OpenLane-V2, subset B"
     assert found.rows == [
         {
             "split": "train",
@@ -219,7 +219,7 @@ def test_both_subsets_in_one_folder(folder, tmp_path):
     )
     shutil.copytree(other, folder, dirs_exist_ok=True)
     found = check_openlane_v2(folder, progress=False)
-    assert (found.subset, found.faults) == ("A and B", [])
+    assert (found.format, found.faults) == ("OpenLane-V2, subset A and B", [])
     assert [(row["subset"], row["segments"], row["images"]) for row in found.rows] == [("A", 1, 21), ("B", 1, 18)]
     change(frame(folder), swap)
     assert [row["faults"] for row in check_openlane_v2(folder, progress=False).rows] == [0, 2]

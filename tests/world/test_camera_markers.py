@@ -148,15 +148,6 @@ def test_a_tilted_marker_lies_in_its_box():
     np.testing.assert_allclose([local[:, 2].min(), local[:, 2].max()], [low, high], atol=1e-9)
 
 
-def test_leaves_hide_the_right_part():
-    place = pose(9.0, 0.0, 2.0)
-    plain, leafy = (drawn(marker_bodies(markers(place), covered=fraction)) for fraction in (0.0, 0.5))
-    columns = np.flatnonzero((plain != leafy).any((0, 2)))
-    middle = project(place[None, :3, 3], CAMERA.intrinsics, CAMERA.camera_from_ego)[0][0, 0]
-    assert abs(columns.min() - middle) < 2.0
-    assert columns.max() > middle + 0.5 * CAMERA.intrinsics[0, 0] / 9.0
-
-
 def test_nothing_to_draw():
     for none in (None, markers()):
         bodies = marker_bodies(none)
@@ -167,16 +158,14 @@ def test_nothing_to_draw():
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"covered": 1.2}, "fraction"),
         ({"size": 0.0}, "size"),
         ({"ids": [100]}, "0 to 99"),
         ({"ids": [-1]}, "0 to 99"),
     ],
 )
 def test_invalid_arguments_are_refused(change, words):
-    covered = change.pop("covered", 0.0)
     with pytest.raises(UserError, match=words):
-        marker_bodies(markers(pose(9.0, 0.0, 2.0), **change), covered=covered)
+        marker_bodies(markers(pose(9.0, 0.0, 2.0), **change))
 
 
 def test_a_window_is_a_part_of_the_image():

@@ -127,7 +127,6 @@ def test_a_light_shows_its_state_inside_its_box(attribute, channel):
     log = scene(street([light()]), element_attribute=np.array([[attribute]]))
     views, seen = render_cameras(log, 0, FRONT), visible_elements(log, 0, FRONT)
     assert seen.visible.tolist() == [True]
-    assert seen.attribute.tolist() == [attribute]
     image = views.image[0].astype(int)
     others = [c for c in (0, 1) if c != channel]
     shining = (image[..., channel] > 150) & (image[..., others].max(-1) < 0.75 * image[..., channel])

@@ -56,7 +56,7 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> int:
         else:
             export_scenes((log for _, log in _drives(driven)), tracks, partial(time_offset, "B"))
     found = check_openlane_v2(out, tracks, cameras="some", progress=False)
-    print(format_table(found.rows, title=f"{out}: OpenLane-V2, subset {found.subset}"))
+    print(format_table(found.rows, title=f"{out}: {found.format}"))
     if found.faults:
         raise UserError(f"what was written to {out} has faults: {found.faults[0]}")
     return 0

@@ -19,7 +19,7 @@ from tflane_jax.datasets.argoverse2_log import (
     load_log,
     log_outline,
 )
-from tflane_jax.datasets.base import SPLITS, ExampleConfig, FrameInfo, Split
+from tflane_jax.datasets.base import SPLITS, ExampleConfig, Split
 from tflane_jax.datasets.data_source import Choice, DataSource, FolderCheck, split_config
 from tflane_jax.datasets.examples import make_example
 from tflane_jax.datasets.log_frames import LogFrames
@@ -70,7 +70,7 @@ class Argoverse2Config(Argoverse2Settings):
     root: Path
 
 
-class Argoverse2Dataset:
+class Argoverse2Dataset(LogFrames):
     """Examples of every log below a folder, sorted by log id, then time.
 
     Boxes and maps are read when an example needs them, see `LogFrames`.
@@ -88,18 +88,15 @@ class Argoverse2Dataset:
         self._folders = find_logs(config.root)
         which = config.keyframes, config.openlane
         outlines = [log_outline(folder, *which) for folder in self._folders]
-        self._frames = LogFrames(outlines, partial(_read, self._folders, *which))
+        super().__init__(outlines, partial(_read, self._folders, *which))
         wanted = config.image is not None
         self._images = [LogImages(folder) if wanted else None for folder in self._folders]
         self._fits = ring_fits(filter(None, self._images), config.image) if config.image is not None else ()
 
-    def __len__(self) -> int:
-        return len(self._frames)
-
     def example(self, index: int) -> Example:
         """Return one example; a camera without an image at that time is not valid."""
-        config, (row, moment) = self.config, self._frames.place(index)
-        example, images = make_example(*self._frames[index], config.example), self._images[row]
+        config, (row, moment) = self.config, self.place(index)
+        example, images = make_example(*self[index], config.example), self._images[row]
         if images is None or config.image is None:
             return example
         cameras = images.at(moment)
@@ -110,19 +107,15 @@ class Argoverse2Dataset:
 
         Raises UserError for an image or a calibration that cannot be read.
         """
-        places = [self._frames.place(index) for index in indices]
+        places = [self.place(index) for index in indices]
         there = {row: LogImages(self._folders[row]) for row, _ in places if has_images(self._folders[row])}
         image = self.config.image or _PICTURES
         fits = ring_fits(there.values(), image)
         return [_views(there[row], moment, fits, image) if row in there else None for row, moment in places]
 
-    def info(self, index: int) -> FrameInfo:
-        """Return log id, time and pose of one example."""
-        return self._frames.info(index)
-
     def drives(self) -> Iterator[Log]:
         """Yield the logs."""
-        return self._frames.logs()
+        return self.logs()
 
 
 def _read(folders: Sequence[Path], keyframes: Keyframes, openlane: Path | None, row: int) -> Log:

@@ -7,7 +7,7 @@ from functools import partial
 from operator import attrgetter
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, UInt8
 
 from tflane_jax.datasets.areas import crop_areas
 from tflane_jax.datasets.base import ExampleConfig, TruncationWarning
@@ -27,6 +27,7 @@ from tflane_jax.geometry import (
 from tflane_jax.scene import Example, MarkerObservations, TrafficFlow
 from tflane_jax.scene.logs import Log, Tracks
 from tflane_jax.world.bev.sensor import BevSensorConfig, hidden_cells, render_bev
+from tflane_jax.world.cameras.moment import attributes_at
 from tflane_jax.world.cameras.sensor import render_cameras, visible_elements
 from tflane_jax.world.roads.sd_map import make_sd_map
 
@@ -121,7 +122,7 @@ def make_example(log: Log, keyframe: int, config: ExampleConfig) -> Example:
     )
     elements, elements_dropped = traffic_elements(
         log.map.elements,
-        _attributes(log, moment.track_frame),
+        attributes_at(log, keyframe),
         *((prepared.chain_of, lanes) if config.elements_of == "centerlines" else (prepared.segment_of, segments)),
         ego_from_global,
         config.range,
@@ -201,13 +202,6 @@ def _buildings(log: Log, ego_from_global: np.ndarray) -> Float[np.ndarray, "b 5"
     blocks = log.map.buildings
     pose = ego_from_global @ yaw_pose(blocks[:, 0], blocks[:, 1], blocks[:, 4])
     return np.stack([pose[:, 0, 3], pose[:, 1, 3], blocks[:, 2], blocks[:, 3], pose_yaw(pose)], -1)
-
-
-def _attributes(log: Log, frame: int) -> Int[np.ndarray, " m"]:
-    """Return the attribute of each of the map's traffic elements in a track frame."""
-    if log.element_attribute is not None:
-        return log.element_attribute[frame]
-    return np.array([element.attribute for element in log.map.elements], int)
 
 
 def warn_dropped(config: ExampleConfig, **dropped: int) -> None:

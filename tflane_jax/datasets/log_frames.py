@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 from tflane_jax.datasets.base import FrameInfo
-from tflane_jax.datasets.recent import Recent
+from tflane_jax.recent import Recent
 from tflane_jax.scene.logs import KeyFrame, Log
 
 KEPT_LOGS = 1024
@@ -27,7 +27,7 @@ class LogOutline:
 
 
 class LogFrames:
-    """Key frames by number, log after log. The last `KEPT_LOGS` logs are kept.
+    """Key frames by number, log after log: base of datasets of logs. The last `KEPT_LOGS` logs are kept.
 
     Args:
         outlines: of the logs.

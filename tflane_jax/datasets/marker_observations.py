@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import datetime
 import warnings
-import weakref
 
 import numpy as np
 from jaxtyping import Float
 
 from tflane_jax.datasets.base import TruncationWarning
 from tflane_jax.datasets.prepared_map import prepare_map
-from tflane_jax.datasets.recent import KeyLocks, made_once
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import PerceptionRange, relative_pose
 from tflane_jax.markers.detection import DetectedMarkers
@@ -19,6 +17,7 @@ from tflane_jax.markers.observe import Detected, observe
 from tflane_jax.markers.pixels import PixelConfig, detect_in_world
 from tflane_jax.markers.simulation import MarkerConfig, moment_before, simulate_detections
 from tflane_jax.markers.store import MarkerStore, store_of
+from tflane_jax.recent import KeptWith
 from tflane_jax.scene import MarkerObservations
 from tflane_jax.scene.logs import KeyFrame, Log, PlacedMarkers
 from tflane_jax.world.cameras.ring import CameraRigConfig
@@ -26,9 +25,8 @@ from tflane_jax.world.mirror import markers_beside
 from tflane_jax.world.roads.markers import PlacementConfig
 
 # Detections in images by log, track frame and settings: key frames are also the earlier moment of later ones.
-_DETECTED: dict[tuple[int, int, CameraRigConfig, PixelConfig], DetectedMarkers] = {}
-_REMEMBERED: dict[tuple[int, float, bool], tuple[PlacedMarkers, MarkerStore]] = {}
-_REMEMBERING = KeyLocks()
+_DETECTED: KeptWith[DetectedMarkers] = KeptWith()
+_REMEMBERED: KeptWith[tuple[PlacedMarkers, MarkerStore]] = KeptWith()
 
 
 def markers_of(log: Log) -> PlacedMarkers:
@@ -65,24 +63,19 @@ def store_of_log(
 
 def _remembered(log: Log, radius: float, bike_lanes: bool) -> tuple[PlacedMarkers, MarkerStore]:
     """Return the markers of a log and their store, made once for all its frames. Threads may call it."""
-    key = (id(log), radius, bike_lanes)
 
     def make() -> tuple[PlacedMarkers, MarkerStore]:
-        weakref.finalize(log, _REMEMBERED.pop, key, None)
         return markers_of(log), store_of_log(log, radius=radius, bike_lanes=bike_lanes)
 
-    return made_once(_REMEMBERED, key, _REMEMBERING, make)
+    return _REMEMBERED(log, (radius, bike_lanes), make)
 
 
 def _detected(
     log: Log, moment: KeyFrame, markers: PlacedMarkers, rig: CameraRigConfig, config: PixelConfig
 ) -> DetectedMarkers:
     """Return the detections in the images of a moment, made once."""
-    key = (id(log), moment.track_frame, rig, config)
-    if key not in _DETECTED:
-        _DETECTED[key] = detect_in_world(log, moment, markers, rig, config)
-        weakref.finalize(log, _DETECTED.pop, key, None)
-    return _DETECTED[key]
+    key = moment.track_frame, rig, config
+    return _DETECTED(log, key, lambda: detect_in_world(log, moment, markers, rig, config))
 
 
 def marker_observations(

@@ -52,12 +52,12 @@ from tflane_jax.datasets.openlane_frames import SUBSETS, FrameCamera
 from tflane_jax.datasets.overlap import frame_drives
 from tflane_jax.datasets.photometric import PhotometricConfig
 from tflane_jax.datasets.prepared_map import prepare_map
-from tflane_jax.datasets.recent import Recent
 from tflane_jax.datasets.streaming import StreamingConfig
 from tflane_jax.datasets.view_images import TOPONET_SUBSET_B, ImageConfig, ImageFit, fit_image
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import relative_pose, transform_points
 from tflane_jax.limits import Count, Rules
+from tflane_jax.recent import Recent
 from tflane_jax.scene import CameraViews, Example, VehicleState
 from tflane_jax.scene.logs import KeyFrame, Log, Tracks, VectorMap
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-from tflane_jax.datasets.base import SPLITS, ExampleConfig, FrameInfo, Split
+from tflane_jax.datasets.base import SPLITS, ExampleConfig, Split
 from tflane_jax.datasets.data_source import Choice, DataSource, FolderCheck, split_config
 from tflane_jax.datasets.examples import make_example
 from tflane_jax.datasets.log_frames import LogFrames
@@ -40,7 +40,7 @@ class SceneFileConfig:
     loading: StreamingConfig = StreamingConfig()
 
 
-class SceneFileDataset:
+class SceneFileDataset(LogFrames):
     """Key frames of scene files, sorted by file name, then time.
 
     Maps and boxes are read when an example needs them, see `LogFrames`.
@@ -57,19 +57,11 @@ class SceneFileDataset:
         if missing := set(config.scenes) - set(files):
             raise UserError(f"{config.root} has no scene {min(missing)}, only {', '.join(files)}")
         chosen = [path for name, path in files.items() if name in (config.scenes or files)]
-        self._frames = LogFrames(list(map(scene_file_outline, chosen)), partial(_read, chosen))
-
-    def __len__(self) -> int:
-        return len(self._frames)
+        super().__init__(list(map(scene_file_outline, chosen)), partial(_read, chosen))
 
     def example(self, index: int) -> Example:
         """Return one example."""
-        log, number = self._frames[index]
-        return make_example(log, number, self.config.example)
-
-    def info(self, index: int) -> FrameInfo:
-        """Return scene, time (from the scene's start) and pose of one example."""
-        return self._frames.info(index)
+        return make_example(*self[index], self.config.example)
 
 
 def _read(files: Sequence[Path], row: int) -> Log:

@@ -8,8 +8,8 @@ from tflane_jax.datasets.log_frames import KEPT_LOGS
 from tflane_jax.datasets.nuscenes_folder import find_tables
 from tflane_jax.datasets.nuscenes_log import Visibility, scene_frames, scene_log
 from tflane_jax.datasets.nuscenes_tables import shared_tables
-from tflane_jax.datasets.recent import Recent
 from tflane_jax.errors import UserError
+from tflane_jax.recent import Recent
 from tflane_jax.scene.logs import Log
 
 

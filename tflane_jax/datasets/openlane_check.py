@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -16,6 +15,7 @@ import numpy as np
 
 from tflane_jax.datasets.areas import is_closed
 from tflane_jax.datasets.base import SPLITS, ExampleConfig, Split
+from tflane_jax.datasets.data_source import FolderCheck
 from tflane_jax.datasets.openlane_annotation import Annotation, read_annotation
 from tflane_jax.datasets.openlane_check_cameras import CameraChecks, Images
 from tflane_jax.datasets.openlane_check_collections import check_collections
@@ -47,23 +47,6 @@ _FARTHEST = 200.0
 _COUNTS = ("segments", "frames", "-ls files", "images", "lanes", "lane segments", "elements", "areas", "SD maps")
 
 
-@dataclass(frozen=True)
-class OpenLaneCheck:
-    """Result of a check.
-
-    Attributes:
-        subset: "A", "B" or "A and B", by the cameras of each segment's first frame.
-        rows: counts of each split, and of each subset where there are both, for a table.
-        faults: sentences, each naming a file.
-        skipped: foreign files, files that were not read, missing logs, and frames that training would not see.
-    """
-
-    subset: str
-    rows: list[dict[str, Any]]
-    faults: list[str]
-    skipped: list[str]
-
-
 def check_openlane_v2(
     root: Path,
     tracks: Path | None = None,
@@ -71,7 +54,7 @@ def check_openlane_v2(
     images: Images = "ends",
     cameras: Literal["all", "some"] = "all",
     progress: bool = True,
-) -> OpenLaneCheck:
+) -> FolderCheck:
     """Check every split that split files or folders contain, and the collections beside them.
 
     Args:
@@ -132,7 +115,8 @@ def check_openlane_v2(
             rows.append({"split": split, **both, **content, "faults": len(faults) - found})
     skipped += _not_named(root, named, on_disk, present)
     of_collections, not_read = check_collections(root, [key for keys in on_disk.values() for key in keys])
-    return OpenLaneCheck(" and ".join(present), rows, [*faults, *of_collections], [*skipped, *not_read])
+    title = f"OpenLane-V2, subset {' and '.join(present)}"
+    return FolderCheck(title, rows, [*faults, *of_collections], [*skipped, *not_read])
 
 
 def _not_named(

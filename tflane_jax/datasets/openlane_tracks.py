@@ -24,9 +24,9 @@ from tflane_jax.datasets.log_frames import KEPT_LOGS
 from tflane_jax.datasets.nuscenes_log import level_poses
 from tflane_jax.datasets.nuscenes_tracks import SceneTracks
 from tflane_jax.datasets.openlane_frames import SUBSETS, SubsetName
-from tflane_jax.datasets.recent import Recent
 from tflane_jax.errors import UserError
 from tflane_jax.files.openlane import FrameKey
+from tflane_jax.recent import Recent
 from tflane_jax.scene import TrafficFlow
 from tflane_jax.scene.logs import KeyFrame, Log
 

@@ -17,11 +17,10 @@ import numpy as np
 from jaxtyping import Float
 
 from tflane_jax.datasets.base import FrameInfo, Split, checked_index
-from tflane_jax.datasets.data_source import Choice, DataSource, FolderCheck, first_or_nominal, split_config
+from tflane_jax.datasets.data_source import Choice, DataSource, first_or_nominal, split_config
 from tflane_jax.datasets.openlane_annotation import read_annotation
 from tflane_jax.datasets.openlane_can_bus import vehicle_state
 from tflane_jax.datasets.openlane_check import check_openlane_v2
-from tflane_jax.datasets.openlane_check_cameras import Images
 from tflane_jax.datasets.openlane_choice import preset_of, subset_of
 from tflane_jax.datasets.openlane_example import area_set, blank, camera_views, element_set, empty_views, lane_graph
 from tflane_jax.datasets.openlane_frames import (
@@ -281,11 +280,6 @@ def _unlabelled(config: OpenLaneV2Config) -> str:
     return f"{found} has no annotation, as the official test split has none: name train or val in its place"
 
 
-def _check(root: Path, tracks: Path | None = None, images: Images = "ends") -> FolderCheck:
-    found = check_openlane_v2(root, tracks, images=images)
-    return FolderCheck(f"OpenLane-V2, subset {found.subset}", found.rows, found.faults, found.skipped)
-
-
 SOURCE = DataSource(
     name="openlane-v2",
     data=OpenLaneV2Data,
@@ -298,7 +292,7 @@ SOURCE = DataSource(
     title=lambda config: f"openlane-v2-{config.subset}-{config.split}",
     drives=lambda config: frame_drives(OpenLaneV2Dataset(config)),
     root="its folder",
-    check=_check,
+    check=check_openlane_v2,
     tracks=True,
     interval=lambda config: 0.5,
     cameras=lambda config: None if config.image is None else SUBSETS[config.subset].cameras,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import weakref
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -12,7 +11,7 @@ from tflane_jax.datasets.chains import merge_chains
 from tflane_jax.datasets.lane_dividers import lane_dividers
 from tflane_jax.datasets.map_geometry import MapGeometry
 from tflane_jax.datasets.packed_lines import PackedLines
-from tflane_jax.datasets.recent import KeyLocks, made_once
+from tflane_jax.recent import KeptWith
 from tflane_jax.scene.logs import LaneSegment, VectorMap
 from tflane_jax.world.bev.map_samples import MapSamples, sample_map
 
@@ -85,8 +84,7 @@ class PreparedMap:
         )
 
 
-_PREPARED: dict[tuple[int, bool], PreparedMap] = {}
-_PREPARING = KeyLocks()
+_PREPARED: KeptWith[PreparedMap] = KeptWith()
 
 
 def prepare_map(vector_map: VectorMap, *, bike_lanes: bool) -> PreparedMap:
@@ -96,13 +94,7 @@ def prepare_map(vector_map: VectorMap, *, bike_lanes: bool) -> PreparedMap:
         vector_map: global frame.
         bike_lanes: whether to keep bicycle lanes. Whether the official ground truth does is unknown; MapTRv2 does.
     """
-    key = (id(vector_map), bike_lanes)
-
-    def make() -> PreparedMap:
-        weakref.finalize(vector_map, _PREPARED.pop, key, None)
-        return _prepare(vector_map, bike_lanes)
-
-    return made_once(_PREPARED, key, _PREPARING, make)
+    return _PREPARED(vector_map, bike_lanes, lambda: _prepare(vector_map, bike_lanes))
 
 
 def _prepare(vector_map: VectorMap, bike_lanes: bool) -> PreparedMap:

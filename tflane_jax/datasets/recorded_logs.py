@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
-from tflane_jax.datasets.base import ExampleConfig, FrameInfo, Split
+from tflane_jax.datasets.base import ExampleConfig, Split
 from tflane_jax.datasets.data_source import Choice, DataSource
 from tflane_jax.datasets.examples import make_example
 from tflane_jax.datasets.log_frames import LogFrames
@@ -48,7 +48,7 @@ class RecordedConfig:
     loading: StreamingConfig = StreamingConfig()
 
 
-class RecordedDataset:
+class RecordedDataset(LogFrames):
     """Key frames of recorded logs, sorted by log, then time.
 
     Maps and boxes are read when an example needs them, see `LogFrames`.
@@ -63,28 +63,21 @@ class RecordedDataset:
         self.config = config
         found = chosen_maps(config.root, config.logs, config.without)
         logs = [one for one in found if one.recorded or config.logs]
-        self._frames = LogFrames([one.outline() for one in logs], partial(_read, logs))
+        super().__init__([one.outline() for one in logs], partial(_read, logs))
         self._giver = chosen_maps(config.root, (config.traffic,))[0].log() if config.traffic else None
-
-    def __len__(self) -> int:
-        return len(self._frames)
 
     def example(self, index: int) -> Example:
         """Return one example. Traffic of another log is that of its frame of the same number, from 0 again after it."""
-        log, number = self._frames[index]
+        log, number = self[index]
         example = make_example(log, number, self.config.example)
         if self._giver is None:
             return example
         other = make_example(self._giver, number % len(self._giver.keyframes), self.config.example)
         return replace(example, traffic_flow=other.traffic_flow)
 
-    def info(self, index: int) -> FrameInfo:
-        """Return log, time and pose of one example."""
-        return self._frames.info(index)
-
     def drives(self) -> Iterator[Log]:
         """Yield the logs."""
-        return self._frames.logs()
+        return self.logs()
 
 
 def _read(logs: Sequence[MapFile], row: int) -> Log:

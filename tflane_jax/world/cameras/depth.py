@@ -11,10 +11,10 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from tflane_jax.geometry import invert_pose
-from tflane_jax.world.cameras.faces import faces_of
 from tflane_jax.world.cameras.solids import Bodies, polygon_starts, with_blobs
 from tflane_jax.world.cameras.surface import Surface
 from tflane_jax.world.render.camera import NEAR, PinholeCamera
+from tflane_jax.world.render.faces import faces_of
 from tflane_jax.world.render.polygons import SHIFT, clipped, fixed_point
 
 # Samples along each side of a cell.

@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from tflane_jax.errors import UserError
 from tflane_jax.scene.logs import PlacedMarkers
-from tflane_jax.scene.marker_patterns import MarkerFamily, board_cells, board_size
+from tflane_jax.scene.marker_patterns import board_cells, board_size
 from tflane_jax.world.cameras.solids import Bodies, Box, pack
 from tflane_jax.world.render.polygons import Solid
 from tflane_jax.world.render.shapes import Colour, box
@@ -20,22 +20,17 @@ from tflane_jax.world.render.shapes import Colour, box
 # The board's thickness and the side of its square post, metres.
 _THICK, _POST = 0.03, 0.1
 _BACK: Colour = (0.55, 0.56, 0.57)
-# Printed white, and the brightness of leaves that cover a board as a fraction of it.
 _WHITE: Colour = (0.93, 0.93, 0.93)
-_LEAVES = 0.22
 
 
-def marker_bodies(markers: PlacedMarkers | None, covered: float = 0.0) -> Bodies:
+def marker_bodies(markers: PlacedMarkers | None) -> Bodies:
     """Return a board and a post for each marker, global frame; none for None.
 
     Args:
         markers: their poses; the ground is at z = 0, and a board lower than the thickness of a post has no post.
-        covered: fraction of each board that leaves hide, from its right edge, 0 to 1.
 
     Raises UserError for a fraction outside 0 to 1, a size that is not positive, or ids outside the family.
     """
-    if not 0.0 <= covered <= 1.0:
-        raise UserError(f"the covered fraction of a marker is between 0 and 1, not {covered}")
     if markers is None:
         return pack([], [])
     if not markers.size > 0.0:
@@ -47,7 +42,7 @@ def marker_bodies(markers: PlacedMarkers | None, covered: float = 0.0) -> Bodies
     faces = 0
     for marker_id, pose in zip(np.asarray(markers.marker_id).tolist(), np.asarray(markers.pose), strict=True):
         board, outline = _board(pose, half)
-        pictures[faces] = _picture(markers.family, marker_id, covered)
+        pictures[faces] = board_cells(markers.family, marker_id).astype(np.float32)
         post = Solid()
         foot, top = pose[:3, 3] - (_THICK + 0.5 * _POST) * pose[:3, 2], float(pose[2, 3] + 0.4 * half)
         heading = float(np.arctan2(pose[1, 2], pose[0, 2]))
@@ -80,13 +75,3 @@ def _board(pose: Float[np.ndarray, "4 4"], half: float) -> tuple[Solid, Box]:
     length, width = high - low
     bottom, top = corners[:, 2].min(), corners[:, 2].max()
     return solid, (cos * u - sin * v, sin * u + cos * v, length, width, heading, bottom, top)
-
-
-def _picture(family: MarkerFamily, marker_id: int, covered: float) -> Float[np.ndarray, "m m"]:
-    """Return the board's cells, 0 to 1; upsampled if part of it is covered."""
-    cells = board_cells(family, marker_id).astype(np.float32)
-    if not covered:
-        return cells
-    cells = np.kron(cells, np.ones((8, 8), np.float32))
-    edge = np.arange(len(cells)) + 0.5 > (1.0 - covered) * len(cells)
-    return np.where(edge[None], np.float32(_LEAVES), cells)

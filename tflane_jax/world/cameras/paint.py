@@ -5,7 +5,7 @@ Global metres. Line types are those of the map. A solid line between opposite di
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -67,12 +67,8 @@ def paint_of(rng: np.random.Generator, vector_map: VectorMap, *, paint_wear: flo
         *_at_lane_ends(vector_map, arrows),
     ]
     worn = 1.0 - 0.8 * paint_wear * rng.random(len(parts) - 1)
-    parts[1:] = [_faded(part, float(left)) for part, left in zip(parts[1:], worn, strict=True)]
+    parts[1:] = [replace(part, left=part.left * float(left)) for part, left in zip(parts[1:], worn, strict=True)]
     return Paint(*(np.concatenate([getattr(part, name) for part in parts]) for name in Paint.__dataclass_fields__))
-
-
-def _faded(part: Paint, left: float) -> Paint:
-    return Paint(part.corners, part.width, part.length, part.colour, part.left * left)
 
 
 def _lines(vector_map: VectorMap, yellow: bool, paint_wear: float, log_seed: int) -> Paint:
@@ -113,8 +109,7 @@ def _lines(vector_map: VectorMap, yellow: bool, paint_wear: float, log_seed: int
         return _quads(np.zeros((2, 0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros((0, 3)))
     number = np.concatenate(numbers)
     quads = _quads(np.concatenate(middles, 1), np.concatenate(normals), np.concatenate(widths), np.concatenate(colours))
-    left = paint_left(number, np.concatenate(stations), len(lines), paint_wear, log_seed)
-    return Paint(quads.corners, quads.width, quads.length, quads.colour, left)
+    return replace(quads, left=paint_left(number, np.concatenate(stations), len(lines), paint_wear, log_seed))
 
 
 def _pieces(total: float, kind: LineType) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:

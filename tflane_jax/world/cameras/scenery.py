@@ -5,7 +5,7 @@ Global metres. Everything is placed off the drivable area; only lamp arms and tr
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -224,16 +224,10 @@ def _trees(
             blobs.append(np.column_stack([[x, y, middle] + radius * offset * [1.1, 1.1, 1.0], size]))
             colours.append(tint * (0.62 + 0.075 * blob)[:, None])
             owners.append(np.full(9, len(trunks) - 1))
-    bodies = pack(trunks, boxes)
-    leaves = Bodies(
-        bodies.boxes,
-        bodies.corners,
-        bodies.stops,
-        bodies.colours,
-        bodies.light,
-        bodies.owner,
-        np.concatenate([np.zeros((0, 4)), *blobs]),
-        np.concatenate([np.zeros((0, 3)), *colours]),
-        np.concatenate([np.zeros(0, int), *owners]),
+    leaves = replace(
+        pack(trunks, boxes),
+        blobs=np.concatenate([np.zeros((0, 4)), *blobs]),
+        blob_colours=np.concatenate([np.zeros((0, 3)), *colours]),
+        blob_owner=np.concatenate([np.zeros(0, int), *owners]),
     )
     return leaves, np.array(crowns).reshape(-1, 4)

@@ -11,7 +11,7 @@ import functools
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, UInt8
 
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import invert_pose
@@ -44,12 +44,10 @@ class ElementViews:
 
     Attributes:
         box: (E, 2, 2) top-left and bottom-right corners in pixels, cut at the border; arbitrary where not visible.
-        attribute: (E,) attribute of each at the key frame.
         visible: (E,) in the image, facing the camera, not mostly occluded, and large enough.
     """
 
     box: Float[np.ndarray, "e 2 2"]
-    attribute: Int[np.ndarray, " e"]
     visible: Bool[np.ndarray, " e"]
 
 
@@ -140,7 +138,7 @@ def visible_elements(log: Log, keyframe: int, config: CameraRigConfig) -> Elemen
     camera = draw_rig(log.seed, config)[0]
     moment, stage = log.keyframes[keyframe], stage_of(log, config)
     if not elements:
-        return ElementViews(np.zeros((0, 2, 2)), attribute, np.zeros(0, bool))
+        return ElementViews(np.zeros((0, 2, 2)), np.zeros(0, bool))
     ego_from_global = invert_pose(moment.global_from_ego)
     box, visible = element_boxes(elements, ego_from_global, camera)
     if log.relief is not None:
@@ -153,7 +151,7 @@ def visible_elements(log: Log, keyframe: int, config: CameraRigConfig) -> Elemen
     occluders = np.concatenate([user_boxes(log, keyframe), standing, shown])
     visible &= unhidden(elements, ego_from_global, camera, occluders, len(occluders) - len(shown))
     visible &= (box[:, 1, 1] - box[:, 0, 1]) >= config.element_pixels * config.scale
-    return ElementViews(box, attribute, visible)
+    return ElementViews(box, visible)
 
 
 @functools.lru_cache(maxsize=32)

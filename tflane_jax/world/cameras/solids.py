@@ -9,16 +9,16 @@ planes.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from tflane_jax.geometry import invert_pose
-from tflane_jax.world.cameras.faces import faces_of
 from tflane_jax.world.cameras.pictures import paint_picture
 from tflane_jax.world.render.camera import PinholeCamera
+from tflane_jax.world.render.faces import faces_of
 from tflane_jax.world.render.polygons import HEADLIGHTS, SHIFT, Solid, clipped, fixed_point
 from tflane_jax.world.render.weather import Weather
 
@@ -71,18 +71,7 @@ class Bodies:
         corners, blobs = self.corners.copy(), self.blobs.copy()
         corners[:, :2] = _turned(self.corners[:, :2], pose[np.repeat(self.owner, _counts(self.stops))])
         blobs[:, :2] = _turned(self.blobs[:, :2], pose[self.blob_owner])
-        return Bodies(
-            boxes,
-            corners,
-            self.stops,
-            self.colours,
-            self.light,
-            self.owner,
-            blobs,
-            self.blob_colours,
-            self.blob_owner,
-            self.pictures,
-        )
+        return replace(self, boxes=boxes, corners=corners, blobs=blobs)
 
     def chosen(self, keep: Bool[np.ndarray, " b"]) -> Bodies:
         """Return the bodies where `keep` is true."""
@@ -265,17 +254,16 @@ def with_blobs(bodies: Bodies, eye: Float[np.ndarray, "3"]) -> Bodies:
     ring = np.cos(angle)[:, None] * right[:, None] + np.sin(angle)[:, None] * up[:, None]
     corners = (bodies.blobs[:, None, :3] + reach * ring).reshape(-1, 3)
     stops = len(bodies.corners) + _OUTLINE * np.arange(1, count + 1)
-    return Bodies(
-        bodies.boxes,
-        np.concatenate([bodies.corners, corners]),
-        np.concatenate([bodies.stops, stops]),
-        np.concatenate([bodies.colours, bodies.blob_colours]),
-        np.concatenate([bodies.light, np.zeros(count)]),
-        np.concatenate([bodies.owner, bodies.blob_owner]),
-        bodies.blobs[:0],
-        bodies.blob_colours[:0],
-        bodies.blob_owner[:0],
-        bodies.pictures,
+    return replace(
+        bodies,
+        corners=np.concatenate([bodies.corners, corners]),
+        stops=np.concatenate([bodies.stops, stops]),
+        colours=np.concatenate([bodies.colours, bodies.blob_colours]),
+        light=np.concatenate([bodies.light, np.zeros(count)]),
+        owner=np.concatenate([bodies.owner, bodies.blob_owner]),
+        blobs=bodies.blobs[:0],
+        blob_colours=bodies.blob_colours[:0],
+        blob_owner=bodies.blob_owner[:0],
     )
 
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import enum
-import weakref
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
 from tflane_jax.files.images import opencv
+from tflane_jax.recent import KeptWith
 from tflane_jax.scene.logs import Log, VectorMap
 from tflane_jax.world.cameras.elements import element_bodies, mast_bodies
 from tflane_jax.world.cameras.ground import Ground, draw_ground
@@ -76,18 +76,15 @@ class Stage:
     users: dict[tuple[int, int], Bodies] = field(default_factory=dict)
 
 
-_STAGES: dict[tuple[int, CameraRigConfig], Stage] = {}
+_STAGES: KeptWith[Stage] = KeptWith()
 
 
 def stage_of(log: Log, config: CameraRigConfig) -> Stage:
     """Return the static content of a log, on level ground, cached for the lifetime of the log object."""
     log = log if log.relief is None else log.relief.level
     # Cameras and their calibration do not change the static content.
-    key = id(log), replace(config, cameras=(), jitter=0.0, multiple=1, element_pixels=0.0, depth_cell=None)
-    if key not in _STAGES:
-        _STAGES[key] = _set_stage(log, config)
-        weakref.finalize(log, _STAGES.pop, key)
-    return _STAGES[key]
+    key = replace(config, cameras=(), jitter=0.0, multiple=1, element_pixels=0.0, depth_cell=None)
+    return _STAGES(log, key, lambda: _set_stage(log, config))
 
 
 def _set_stage(log: Log, config: CameraRigConfig) -> Stage:
@@ -124,7 +121,7 @@ def _set_stage(log: Log, config: CameraRigConfig) -> Stage:
     )
 
 
-_BOXES: dict[tuple[int, int], np.ndarray] = {}
+_BOXES: KeptWith[np.ndarray] = KeptWith()
 
 
 def static_boxes(log: Log) -> Float[np.ndarray, "b 7"]:
@@ -138,9 +135,10 @@ def static_boxes(log: Log) -> Float[np.ndarray, "b 7"]:
 
 def map_boxes(vector_map: VectorMap, seed: int) -> Float[np.ndarray, "b 7"]:
     """Return `static_boxes` of the world's scene with this map and seed; cached for the lifetime of the map."""
-    key = id(vector_map), seed
-    if key in _BOXES:
-        return _BOXES[key]
+    return _BOXES(vector_map, seed, lambda: _map_boxes(vector_map, seed))
+
+
+def _map_boxes(vector_map: VectorMap, seed: int) -> Float[np.ndarray, "b 7"]:
     opencv()
     scenery = draw_scenery(np.random.default_rng([ROOT, seed, Stream.SCENERY]), vector_map, 0.0)
     masts = mast_bodies(vector_map.elements, vector_map.road_boundaries)
@@ -148,9 +146,7 @@ def map_boxes(vector_map: VectorMap, seed: int) -> Float[np.ndarray, "b 7"]:
     boxes = [scenery.bodies.boxes, masts.boxes]
     if len(shown):
         boxes.append(element_bodies(vector_map.elements, shown).boxes)
-    _BOXES[key] = np.concatenate(boxes)
-    weakref.finalize(vector_map, _BOXES.pop, key, None)
-    return _BOXES[key]
+    return np.concatenate(boxes)
 
 
 def _buildings(log: Log) -> Float[np.ndarray, "b 7"]:

@@ -7,7 +7,7 @@ is where its ray first meets the surface; its texture is that of the level groun
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -62,18 +62,7 @@ class Surface:
         owner = np.repeat(level.owner, np.diff(level.stops, prepend=0))
         np.minimum.at(boxes[:, 5], owner, corners[:, 2])
         np.maximum.at(boxes[:, 6], owner, corners[:, 2])
-        return Bodies(
-            boxes,
-            corners,
-            level.stops,
-            level.colours,
-            level.light,
-            level.owner,
-            blobs,
-            level.blob_colours,
-            level.blob_owner,
-            level.pictures,
-        )
+        return replace(level, boxes=boxes, corners=corners, blobs=blobs)
 
     def hits(self, camera: PinholeCamera) -> tuple[Float[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"], np.ndarray]:
         """Return where the rays of a camera's pixels first meet the ground, level frame, and which do.

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from tflane_jax.world.render.camera import NEAR, PinholeCamera
+from tflane_jax.world.render.faces import faces_of
 from tflane_jax.world.render.weather import Weather
 
 # cv2 takes corners as multiples of 1/16 pixel.
@@ -54,28 +55,15 @@ def draw_solids(
     points = np.concatenate(corners)
     stops = np.cumsum([len(ring) for ring in corners])
     starts = np.concatenate([[0], stops[:-1]])
-    # Outward normals from the first three corners.
-    a = points[starts]
-    normal = np.cross(points[starts + 1] - a, points[starts + 2] - a)
-    facing = (([0.0, 0.0, camera.above_ground] - a) * normal).sum(-1) > 0.0
-    pixels, depth = camera.image_of(points)
-    low, high = np.minimum.reduceat(pixels, starts), np.maximum.reduceat(pixels, starts)
-    nearest, farthest = np.minimum.reduceat(depth, starts), np.maximum.reduceat(depth, starts)
-    size = [camera.width, camera.height]
-    visible = facing & (((high > 0.0) & (low < size)).all(-1) | (nearest <= NEAR)) & (farthest > NEAR)
-    colours = shade(
-        np.concatenate([solid.colours for solid in ordered]),
-        normal,
-        np.concatenate([solid.light for solid in ordered]),
-        a,
-        weather,
-    ).tolist()
-    fixed = fixed_point(pixels)
-    for number in np.flatnonzero(visible):
+    faces = faces_of(points, starts, camera, np.array([0.0, 0.0, camera.above_ground]))
+    colours, light = (np.concatenate([getattr(solid, name) for solid in ordered]) for name in ("colours", "light"))
+    colours = shade(colours, faces.normal, light, faces.corner, weather).tolist()
+    fixed = fixed_point(faces.pixels)
+    for number in faces.shown.tolist():
         part = slice(starts[number], stops[number])
         ring = fixed[part]
-        if nearest[number] <= NEAR:
-            ring = fixed_point(camera.image_of(clipped(points[part], depth[part]))[0])
+        if faces.near[number]:
+            ring = fixed_point(camera.image_of(clipped(points[part], faces.depth[part]))[0])
         cv2.fillPoly(image, [ring], colours[number], cv2.LINE_AA, SHIFT)
 
 

@@ -77,7 +77,7 @@ def turn_green(signals: Signals, intersection: int, phase: int, time: float) -> 
     before = (signals.green[intersection, :phase] + _CLEARANCE * (signals.green[intersection, :phase] > 0.0)).sum()
     offset = signals.offset.copy()
     offset[intersection] = before - time
-    return Signals(signals.green, offset)
+    return replace(signals, offset=offset)
 
 
 def element_states(network: RoadNetwork, signals: Signals, times: Float[np.ndarray, " f"]) -> Int[np.ndarray, "f e"]:

@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import contextlib
 import threading
+import weakref
 from collections import OrderedDict
-from collections.abc import Callable, Hashable, Iterator, MutableMapping
+from collections.abc import Callable, Hashable, Iterator
 from typing import Generic, TypeVar
 
 K = TypeVar("K", bound=Hashable)
@@ -37,13 +38,24 @@ class KeyLocks:
                     self._used[key] = own, users - 1
 
 
-def made_once(kept: MutableMapping[K, V], key: K, making: KeyLocks, make: Callable[[], V]) -> V:
-    """Return the kept value of a key (never None), or make and keep it; an error of `make` leaves nothing behind."""
-    if (found := kept.get(key)) is None:
-        with making(key):
-            if (found := kept.get(key)) is None:
-                found = kept[key] = make()
-    return found
+class KeptWith(Generic[V]):
+    """Values (never None) made once for an object and a key, and kept as long as the object lives. Threads may call it.
+
+    An error of `make` leaves nothing behind.
+    """
+
+    def __init__(self) -> None:
+        self._kept: dict[tuple[int, Hashable], V] = {}
+        self._making = KeyLocks()
+
+    def __call__(self, owner: object, key: Hashable, make: Callable[[], V]) -> V:
+        full = id(owner), key
+        if (found := self._kept.get(full)) is None:
+            with self._making(full):
+                if (found := self._kept.get(full)) is None:
+                    found = self._kept[full] = make()
+                    weakref.finalize(owner, self._kept.pop, full, None)
+        return found
 
 
 class Recent(Generic[K, V]):

@@ -1,12 +1,14 @@
 """Values that are kept until others are asked for."""
 
+import gc
 import pickle
 import threading
+import time
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from tflane_jax.datasets.recent import Recent
+from tflane_jax.recent import KeptWith, Recent
 
 
 def counted(most):
@@ -43,6 +45,37 @@ def test_threads_share_one_value():
     for thread in threads:
         thread.join()
     assert sorted(made) == [0, 1, 2, 3]
+
+
+class Owner:
+    """What values are kept with."""
+
+
+def test_a_value_is_made_once_for_an_object_and_goes_with_it():
+    """Regression: two threads drew one stage, and the end of its log then printed a KeyError."""
+    kept, made, owner, other = KeptWith(), [], Owner(), Owner()
+
+    def make():
+        made.append(threading.get_ident())
+        time.sleep(0.05)
+        return len(made)
+
+    with ThreadPoolExecutor(4) as pool:
+        assert set(pool.map(lambda _: kept(owner, "key", make), range(4))) == {1}
+    assert kept(owner, "another", make) == 2
+    assert kept(other, "key", make) == 3
+    del owner
+    gc.collect()
+    assert len(kept._kept) == 1
+    assert kept(other, "key", make) == 3
+
+
+def test_what_cannot_be_made_for_an_object_is_tried_again():
+    kept, owner = KeptWith(), Owner()
+    for _ in range(2):
+        with pytest.raises(ZeroDivisionError):
+            kept(owner, 0, lambda: 1 // 0)
+    assert kept(owner, 0, lambda: 1) == 1
 
 
 @pytest.fixture

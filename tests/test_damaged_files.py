@@ -137,6 +137,8 @@ def test_damaged_files_of_a_run_are_named(run, file, content):
         (lambda c: c["optim"].update(lr=None), "optim.lr cannot be None"),
         (lambda c: c["optim"].update(restarts=[1]), "optim.restarts cannot be"),
         (lambda c: c["optim"].update(lrr=1.0), "optim.lrr is unknown"),
+        (lambda c: c["optim"].update({"\x1b[2J\nall good": 1.0}), r"optim.\x1b[2J\nall good is unknown"),
+        (lambda c: c["task"].update({"class": "\x1b[2JTask"}), r"class \x1b[2JTask (setting task) is not part"),
         (lambda c: c["training"].update(seeds=0), "training.seeds cannot be 0"),
         (lambda c: c["training"].update(seeds=[]), "training.seeds is ()"),
         (lambda c: c["training"].update(steps=0), "training.steps is 0"),

@@ -269,3 +269,14 @@ def test_the_own_loss_of_the_page_adds_its_term(monkeypatch):
     batch = stack_examples([make_example(0)])
     params = jax.eval_shape(task.init, jax.random.key(0), make_example(0))
     assert "smooth" in jax.eval_shape(task.loss, params, batch, jax.random.key(0))[1]
+
+
+def test_a_command_that_names_nothing_of_the_users_imports_nothing_from_the_working_directory(monkeypatch):
+    """Regression: libraries probe for optional packages, and a downloaded folder could hold files of their names."""
+    monkeypatch.setattr(sys, "path", [folder for folder in sys.path if folder])
+    assert main(["eval", "run"]) == 2
+    assert os.getcwd() not in sys.path
+    Path("helper.py").touch()
+    Path("own.py").write_text("import helper\nfrom tflane_jax.config import RunConfig as get_config\n")
+    assert load_config("own.py") == RunConfig()
+    assert os.getcwd() in sys.path

@@ -24,9 +24,9 @@ from typing import Any, TextIO
 
 from tflane_jax.commands.arguments import comparisons, data, markers, models
 from tflane_jax.commands.arguments.shared import CommandParser
-from tflane_jax.errors import Interrupted, UserError, not_installed
+from tflane_jax.errors import Interrupted, UserError, not_installed, printable
 from tflane_jax.memory import keep_freed_memory
-from tflane_jax.own_modules import add_imports, import_own, look_in, take_imports
+from tflane_jax.own_modules import add_imports, import_own, take_imports
 from tflane_jax.startup import leave
 
 _AGAIN_SECONDS = 0.1
@@ -66,7 +66,6 @@ def _run(arguments: Sequence[str]) -> int:
     _check_filled(arguments)
     modules, others = take_imports(arguments)
     add_imports(modules)
-    look_in(None)
     import_own()  # before names of own datasets are read
     parser = build_parser()
     options, rest = parser.parse_known_args(others)
@@ -135,9 +134,12 @@ def exit_code(run: Callable[[], int]) -> int:
 
 
 def _tell(text: str) -> None:
-    """Print a line on standard error; where that cannot be written, the exit code alone tells of the error."""
+    """Print a line on standard error; where that cannot be written, the exit code alone tells of the error.
+
+    Texts of files may be in it: none of them controls the terminal.
+    """
     try:
-        print(text, file=sys.stderr)
+        print(printable(text, "\n\t"), file=sys.stderr)
     except OSError:
         _drop_output(sys.stderr)
 

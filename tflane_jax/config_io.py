@@ -22,7 +22,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, TypeGuard, TypeVar
 
-from tflane_jax.errors import UserError
+from tflane_jax.errors import UserError, printable
 from tflane_jax.own_modules import VARIABLE, import_own
 
 T = TypeVar("T")
@@ -175,7 +175,7 @@ def first_difference(there: dict[str, Any], here: dict[str, Any], prefix: str = 
 
 
 def _shown(value: Any) -> str:
-    return str(value.get("class", value)) if isinstance(value, dict) else str(value)
+    return printable(str(value.get("class", value) if isinstance(value, dict) else value))
 
 
 def _dataclass(kind: Any, content: Any, path: str) -> Any:
@@ -193,7 +193,7 @@ def _dataclass(kind: Any, content: Any, path: str) -> Any:
     if unknown:
         close = difflib.get_close_matches(unknown[0], names, 3)
         hint = f"; did you mean {' or '.join(path + name for name in close)}?" if close else ""
-        raise UserError(f"setting {path}{unknown[0]} is unknown to this version of tflane_jax{hint}")
+        raise UserError(f"setting {path}{printable(unknown[0])} is unknown to this version of tflane_jax{hint}")
     values = {name: _value(hints[name], content[name], path + name) for name in names & content.keys()}
     missing = [f.name for f in dataclasses.fields(kind) if f.name not in values and _is_required(f)]
     if missing:
@@ -207,8 +207,8 @@ def _check_known(content: dict[str, Any], name: str) -> None:
     if not isinstance(kind, str) or any(kind in vars(module) for module in list(sys.modules.values())):
         return
     raise UserError(
-        f"class {kind} (setting {name}) is not part of this version of tflane_jax: if it is yours, import its module "
-        f"(--import MODULE or {VARIABLE})"
+        f"class {printable(kind)} (setting {name}) is not part of this version of tflane_jax: if it is yours, import "
+        f"its module (--import MODULE or {VARIABLE})"
     )
 
 

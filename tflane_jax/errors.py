@@ -51,3 +51,10 @@ class Interrupted(KeyboardInterrupt):
     def __init__(self, number: int):
         super().__init__(f"signal {number}")
         self.number = number
+
+
+def printable(text: str, kept: str = "") -> str:
+    """Return a text with escapes for what a terminal would obey and not show, but for characters of `kept`."""
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() or c in kept else c.encode("unicode_escape").decode() for c in text)

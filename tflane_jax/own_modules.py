@@ -90,13 +90,15 @@ def look_in(folder: Path | None) -> None:
 def import_file(path: Path, *, beside: bool = True) -> ModuleType:
     """Return the module of a Python file, which runs once as long as its content stays the same.
 
-    Its name comes from path and content. With `beside`, modules in its folder can be imported from then on.
+    Its name comes from path and content. With `beside`, modules in its folder and in the working directory can be
+    imported from then on.
     """
     path = path.resolve()
     known = _files()
     if str(path) not in known:
         os.environ[_FILES] = "\n".join([*known, str(path)])
     if beside:
+        look_in(None)
         look_in(path.parent)
         _beside.add(str(path.parent))
     return importlib.import_module(_module_name(path))

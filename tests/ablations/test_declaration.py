@@ -212,7 +212,15 @@ def test_logs_and_files_are_declared(tiny, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "value"), [("claims", "none"), ("claims", [{"treatment": "tfm"}]), ("configurations", {"tfm": 3})]
+    ("name", "value"),
+    [
+        ("claims", "none"),
+        ("claims", [{"treatment": "tfm"}]),
+        ("configurations", {"tfm": 3}),
+        ("seeds", [[1]]),
+        ("seeds", [True]),
+        ("time", "now\n# Verdict: shown"),
+    ],
 )
 def test_a_damaged_declaration_is_named(tiny, tmp_path, name, value):
     declared(tiny, tmp_path)

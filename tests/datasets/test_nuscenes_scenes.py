@@ -140,8 +140,17 @@ DAMAGE = {
     "lengths as fractions": (changed(polygon_len=np.ones(5)), "polygon_len must be 5 whole numbers"),
     "negative lengths": (changed(polyline_len=np.array([4, 3, 2, 7, -1])), "polyline_len must be 5 whole numbers"),
     "meta no JSON": (changed(meta=np.array("scene")), "meta is no JSON text"),
-    "no rate": (changed(meta=np.array('{"scene": "a", "rate_hz": 0}')), "rate_hz key frames a second, not 'a' and 0"),
-    "no time at all": (changed(meta=np.array('{"scene": "a", "rate_hz": 1e-300}')), "not 'a' and 1e-300"),
+    "meta too deep": (changed(meta=np.array("[" * 100_000)), "meta is no JSON text of this kind: .* nested too deep"),
+    "meta of many digits": (changed(meta=np.array("1" * 5000)), "meta is no JSON text that can be read"),
+    "no rate": (changed(meta=np.array('{"scene": "a", "rate_hz": 0}')), "rate_hz must be key frames a second, not 0"),
+    "no time at all": (changed(meta=np.array('{"scene": "a", "rate_hz": 1e-300}')), "a second, not 1e-300"),
+    **{
+        f"name {name!a:.20}": (
+            changed(meta=np.array(json.dumps({"scene": name, "rate_hz": 2}))),
+            "meta: scene is .*, expected a name that can be that of a file",
+        )
+        for name in ("", "..", "/elsewhere/a", "../a", "a\\b", "a\nb", "\ud800", "\x1b[2J", "a" * 201, 3)
+    },
     "objects": (changed(category=np.array([{}, {}], object)), "no .npz file of plain arrays"),
     **{f"{key} missing": (lambda scene, key=key: scene.pop(key), f"lacks the entry '{key}'") for key in content()},
 }

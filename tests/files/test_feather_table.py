@@ -3,6 +3,7 @@
 import pytest
 
 from tflane_jax.errors import UserError
+from tflane_jax.files import feather_table
 from tflane_jax.files.feather_table import read_columns
 
 pyarrow = pytest.importorskip("pyarrow")
@@ -20,6 +21,15 @@ def test_a_long_text_is_refused(tmp_path, kind):
         read_columns(path, {"track_uuid": "text"})
     feather.write_feather(pyarrow.table({"track_uuid": column[:0]}), path)
     assert read_columns(path, {"track_uuid": "text"})["track_uuid"].shape == (0,)
+
+
+def test_more_rows_than_a_log_has_are_refused(tmp_path, monkeypatch):
+    path = tmp_path / "annotations.feather"
+    feather.write_feather(pyarrow.table({"length_m": [1.0] * 11}), path)
+    assert len(read_columns(path, {"length_m": "number"})["length_m"]) == 11
+    monkeypatch.setattr(feather_table, "_MOST_ROWS", 10)
+    with pytest.raises(UserError, match=r"annotations\.feather has 11 rows of .* GiB: it is no file of one log"):
+        read_columns(path, {"length_m": "number"})
 
 
 @pytest.mark.parametrize("kind", ["text", "dictionary"])

@@ -1,7 +1,10 @@
 """Photographs: formats, depths, orientation, damaged files, the rounding of resizing."""
 
 import builtins
+import struct
+import subprocess
 import sys
+import zlib
 from pathlib import Path
 
 import cv2
@@ -9,7 +12,7 @@ import numpy as np
 import pytest
 
 from tests.golden import case_id, golden_modules, load_module_case
-from tests.shared import random_photo
+from tests.shared import ROOT, random_photo
 from tflane_jax.errors import LeftOutWarning, UserError
 from tflane_jax.files.images import DarkImageWarning, list_photos, read_image, resize
 
@@ -142,3 +145,17 @@ def test_opencv_prints_nothing_beside_the_message(tmp_path, capfd):
     with pytest.raises(UserError, match=r"depth.tiff is damaged or no image of a known format"):
         read_image(path)
     assert capfd.readouterr() == ("", "")
+
+
+def test_more_pixels_than_fit_into_memory_are_refused(tmp_path):
+    """OpenCV reads its limit when it is imported. This image has 120 kB and would take 6 GB."""
+    rows = zlib.compress(b"\0" * (32_000 // 8 + 1) * 32_000, 9)
+    header = struct.pack(">IIBBBBB", 32_000, 32_000, 1, 0, 0, 0, 0)
+    parts = ((b"IHDR", header), (b"IDAT", rows), (b"IEND", b""))
+    content = b"\x89PNG\r\n\x1a\n"
+    for kind, data in parts:
+        content += struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+    (tmp_path / "a.png").write_bytes(content)
+    code = "import sys; from tflane_jax.files.images import read_image; read_image(sys.argv[1])"
+    done = subprocess.run([sys.executable, "-c", code, tmp_path / "a.png"], cwd=ROOT, capture_output=True, text=True)
+    assert "a.png has more than 134,217,728 pixels: make it smaller" in done.stderr

@@ -96,6 +96,35 @@ def test_an_array_of_no_bytes_claims_no_length(tmp_path, state):
         load_plain_pickle(tmp_path / "long.pkl")
 
 
+def tower(levels, memo):
+    """Return instructions for F(k + 1) = frozenset({(F(k), 0), (F(k), 1)}), by protocol 4."""
+    code = b"(K\x00\x91"
+    for level in range(levels):
+        pairs = (b"h" + bytes([memo + level, ord("K"), part]) + b"\x86" for part in (0, 1))
+        code += b"\x940(" + b"".join(pairs) + b"\x91"
+    return code
+
+
+def test_sets_that_hold_each_other_twice_are_refused(tmp_path):
+    """Regression: two equal ones of 60 levels were compared for ever, and no signal ended it."""
+    for levels, most in ((3, True), (60, False)):
+        code = b"\x80\x04}(" + tower(levels, 0) + b"K\x01" + tower(levels, levels) + b"K\x02u."
+        (tmp_path / "key.pkl").write_bytes(code)
+        if most:
+            assert list(load_plain_pickle(tmp_path / "key.pkl").values()) == [2]
+        else:
+            with pytest.raises(UserError, match="hold each other too many times"):
+                load_plain_pickle(tmp_path / "key.pkl")
+
+
+@pytest.mark.parametrize("protocol", [0, 3])
+def test_older_protocols_have_no_sets_of_sets(tmp_path, protocol):
+    for within in (frozenset({1}), (1, 2)):
+        (tmp_path / "key.pkl").write_bytes(pickle.dumps({frozenset({within}): 1}, protocol))
+        with pytest.raises(UserError, match="its sets hold tuples or sets"):
+            load_plain_pickle(tmp_path / "key.pkl")
+
+
 @pytest.mark.parametrize(
     "twice",
     [lambda _: b"2\x86", lambda i: b"q" + bytes([i]) + b"h" + bytes([i]) + b"\x86"],

@@ -39,6 +39,12 @@ def test_cells_without_a_number(value, shown):
     assert format_table([{"x": value}]).splitlines()[-1].strip("| ") == shown
 
 
+def test_texts_of_files_control_no_terminal_and_make_no_lines():
+    table = format_table([{"scene": "a\x1b[2J\n# b|c\r", "n": 1}])
+    assert len(table.splitlines()) == 3
+    assert r"| a\x1b[2J # b\|c\r |" in table
+
+
 def test_without_rows_the_table_has_a_header_only_and_without_columns_nothing():
     assert format_table([], ["a"]) == "| a   |\n| --- |"
     assert format_table([], title="a title") == "a title"

@@ -274,6 +274,10 @@ def _read(path: Path) -> dict[str, Any]:
     for claim in found["claims"]:
         if not isinstance(claim, dict) or not claim.keys() >= {"treatment", "control"}:
             raise UserError(f"{path} is damaged (claims); {remedy}")
+    if not all(type(seed) is int for seed in found["seeds"]):
+        raise UserError(f"{path} is damaged (seeds); {remedy}")
+    if not found["time"].isprintable():
+        raise UserError(f"{path} is damaged (time); {remedy}")
     if not all(isinstance(config, dict) for config in found.get(_CONFIGURATIONS, {}).values()):
         raise UserError(f"{path} is damaged ({_CONFIGURATIONS}); {remedy}")
     return found

@@ -14,7 +14,7 @@ from tflane_jax.datasets.nuscenes_tables import TABLES, check_tables, file_state
 from tflane_jax.errors import UserError
 from tflane_jax.files.fields import member
 from tflane_jax.files.json_rows import json_rows
-from tflane_jax.files.wording import shown
+from tflane_jax.files.wording import file_name, shown
 from tflane_jax.scene.logs import Log
 
 SCENE_TABLE = "scene.json"
@@ -38,11 +38,11 @@ def scene_files(scenes: Path) -> Iterator[tuple[str, tuple[Path, ...]]]:
     others = tuple(scenes.with_name(f"{name}.json") for name in TABLES if f"{name}.json" != scenes.name)
     expansions = scenes.parent.parent / "maps" / "expansion"
     for row in json_rows(scenes):
-        name, place = _text(row, "name", scenes), city.get(_text(row, "log_token", scenes))
+        name = file_name(member(row, "name", f"{scenes}: a row"), f"{scenes}: name")
+        place = city.get(_text(row, "log_token", scenes))
         if place is None:
             raise UserError(f"{scenes}: scene {name} names a log that is not in {logs}")
-        if Path(place).name != place:
-            raise UserError(f"{logs}: location is {shown(place)}, expected the name of a city")
+        file_name(place, f"{logs}: location")
         yield name, (scenes, *others, expansions / f"{place}.json")
 
 

@@ -13,7 +13,6 @@ Global metres; no pickle inside.
 
 from __future__ import annotations
 
-import json
 import zlib
 from collections.abc import Mapping
 from dataclasses import replace
@@ -37,9 +36,9 @@ from tflane_jax.datasets.plausible import (
     check_steps,
 )
 from tflane_jax.errors import UserError
-from tflane_jax.files.fields import member, numbers
+from tflane_jax.files.fields import member, numbers, parse_json
 from tflane_jax.files.npz import read_npz
-from tflane_jax.files.wording import shown
+from tflane_jax.files.wording import file_name
 from tflane_jax.geometry import invert_pose, line_distances, transform_points, without_repeats, wrap_angle, yaw_pose
 from tflane_jax.scene import LineType, RoadUser
 from tflane_jax.scene.logs import KeyFrame, LaneSegment, Log, Tracks, VectorMap
@@ -149,16 +148,11 @@ def _content(path: Path) -> dict[str, Any]:
 
 def _meta(text: np.ndarray, where: str) -> tuple[str, int, str]:
     """Return the scene's name, the time between frames (nanoseconds), and its city, "" where it is not recorded."""
-    try:
-        meta = json.loads(str(text))
-    except json.JSONDecodeError as error:
-        raise UserError(f"{where} is no JSON text: {error.msg}") from None
+    meta = parse_json(str(text), where, "JSON text")
     rate = float(numbers(member(meta, "rate_hz", where), (), f"{where}: rate_hz"))
-    name = member(meta, "scene", where)
-    if not isinstance(name, str) or not 1.0 / LONGEST <= rate <= 1.0 / SHORTEST:
-        raise UserError(
-            f"{where}: scene must be a text and rate_hz key frames a second, not {shown(name)} and {rate:g}"
-        )
+    name = file_name(member(meta, "scene", where), f"{where}: scene")
+    if not 1.0 / LONGEST <= rate <= 1.0 / SHORTEST:
+        raise UserError(f"{where}: rate_hz must be key frames a second, not {rate:g}")
     area = meta.get("location", "")
     return name, round(1e9 / rate), area if isinstance(area, str) else ""
 

@@ -13,6 +13,8 @@ from tflane_jax.errors import UserError, missing_extra
 Kind = Literal["integer", "number", "text"]
 """What a column holds: whole numbers (int64), finite numbers (float64), or text (str)."""
 _LONGEST_TEXT = 1000
+# Logs have up to some 50,000 rows.
+_MOST_ROWS, _MOST_BYTES = 10**7, 2**31
 
 
 def read_columns(path: Path, columns: Mapping[str, Kind]) -> dict[str, np.ndarray]:
@@ -31,6 +33,10 @@ def read_columns(path: Path, columns: Mapping[str, Kind]) -> dict[str, np.ndarra
         raise UserError(f"{path} is missing: download it with the Argoverse 2 sensor dataset")
     try:
         table = feather.read_table(path)
+        if table.num_rows > _MOST_ROWS or table.nbytes > _MOST_BYTES:
+            raise UserError(
+                f"{path} has {table.num_rows:,} rows of {table.nbytes / 2**30:.3g} GiB: it is no file of one log"
+            )
         # Of a damaged file, offsets and numbers of dictionary entries may point anywhere.
         table.validate(full=True)
     except (pyarrow.ArrowException, OSError) as error:

@@ -25,6 +25,8 @@ LARGEST_SIDE = 2**15 - 2
 _NAMED = 3  # files in a message
 # Place of the principal point, as fractions of width and height, outside of which an image is of another size.
 _SCALED = (0.3, 0.75)
+# Environment variable of OpenCV, and the pixels that it takes where the variable is not set.
+_PIXELS, _MOST_PIXELS = "OPENCV_IO_MAX_IMAGE_PIXELS", 2**27
 # Largest value of a 16-bit image that is as good as black in 8 bits.
 _DARK = 2**14
 
@@ -36,6 +38,8 @@ class DarkImageWarning(UserWarning):
 def opencv() -> ModuleType:
     """Return the module cv2; raises UserError that names the extra where it is not installed."""
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # quiet; FFmpeg prints beside OpenCV's own log
+    # A file of 100 kB may claim more pixels than fit into memory; panoramas of 30,000 by 4,000 fit.
+    os.environ.setdefault(_PIXELS, str(_MOST_PIXELS))
     try:
         import cv2
     except ImportError as error:
@@ -120,6 +124,9 @@ def read_image(path: Path) -> UInt8[np.ndarray, "h w 3"]:
         with quiet_opencv():
             image = cv2.imdecode(data, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
     except cv2.error as error:
+        if "MAX_IMAGE_PIXELS" in error.err:
+            most = f"{int(os.environ[_PIXELS]):,}"
+            raise UserError(f"{path} has more than {most} pixels: make it smaller, or set {_PIXELS}") from None
         raise UserError(f"cannot read the image {path}: {error.err}") from None
     if image is None or image.dtype not in (np.uint8, np.uint16):
         raise UserError(

@@ -27,7 +27,7 @@ from tflane_jax.files.npz import check_places
 _CODE = re.compile(r"[<>=|]?(\?|[biufcSUOMmV]\d{0,6})")
 
 _PUTS, _GETS = ("PUT", "BINPUT", "LONG_BINPUT"), ("GET", "BINGET", "LONG_BINGET")
-_TUPLES = ("TUPLE", "TUPLE1", "TUPLE2", "TUPLE3")
+_TUPLES = ("TUPLE", "TUPLE1", "TUPLE2", "TUPLE3", "FROZENSET")  # what can be in a key, with other such in it
 _CONSTANTS = frozenset(
     code.name
     for code in pickletools.opcodes
@@ -251,6 +251,14 @@ def _plain(kind: _Type) -> np.dtype:
     return kind.dtype
 
 
+def _frozenset(members: Any = ()) -> frozenset[Any]:
+    """Return a set, as older pickles make it: from a list, whose content `_TupleSizes` does not follow."""
+    members = list(members)
+    if any(isinstance(one, tuple | frozenset) for one in members):
+        raise pickle.UnpicklingError("its sets hold tuples or sets")
+    return frozenset(members)
+
+
 # Not the class itself: a file could call it with a shape of any size.
 _NDARRAY = "numpy.ndarray"
 _NUMPY: dict[str, dict[str, Callable[..., Any]]] = {
@@ -259,7 +267,7 @@ _NUMPY: dict[str, dict[str, Callable[..., Any]]] = {
 }
 _BUILTINS = {
     "set": set,
-    "frozenset": frozenset,
+    "frozenset": Sealed(_frozenset),
     "complex": complex,
     "bytes": Sealed(_bytes),
     "bytearray": Sealed(_bytearray),

@@ -64,6 +64,16 @@ def short_stem(path: Path) -> str:
     return os.fsencode(path.stem)[:_LONGEST_STEM].decode(errors="ignore")
 
 
+def file_name(value: Any, where: str) -> str:
+    """Return a name from which names of files are made: it leads to no other folder, and can be printed."""
+    plain = (
+        isinstance(value, str) and value.isprintable() and not {"/", "\\"} & set(value) and value not in ("", ".", "..")
+    )
+    if not plain or len(value.encode()) > _LONGEST_STEM:
+        raise UserError(f"{where} is {shown(value)}, expected a name that can be that of a file")
+    return value
+
+
 def kind(value: Any) -> str:
     """Return of which type a value is, as the end of a sentence."""
     return "missing (null)" if value is None else f"of type {type(value).__name__}"

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from tflane_jax.errors import printable
 from tflane_jax.files.atomic import check_stem, write_text
 
 Row = Mapping[str, Any]
@@ -124,7 +125,7 @@ def _cell(value: Any, digits: int) -> str:
     if isinstance(value, (float, np.floating)):
         return "n/a" if math.isnan(value) else f"{value:.{digits}f}"
     # A bar would end the cell, a line break the table.
-    return str(value).replace("|", "\\|").replace("\n", " ")
+    return printable(str(value).replace("|", "\\|").replace("\n", " "))
 
 
 _LATEX = {

@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import math
 import os
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -81,8 +82,17 @@ def load_arrays(folder: Path) -> dict[str, np.ndarray]:
 
     with _checkpointer() as reader:
         names = reader.metadata(folder.absolute()).item_metadata.tree
+        _check_memory([(leaf.shape, np.dtype(leaf.dtype)) for leaf in jax.tree.leaves(names)])
         as_numpy = jax.tree.map(lambda _: ocp.RestoreArgs(restore_type=np.ndarray), names)
         return flat(reader.restore(folder.absolute(), args=ocp.args.PyTreeRestore(restore_args=as_numpy)))
+
+
+def _check_memory(arrays: Sequence[tuple[Sequence[int], np.dtype]]) -> None:
+    """Raise ValueError for arrays that this machine cannot hold: allocating them would end the process."""
+    needed = sum(math.prod(shape) * dtype.itemsize for shape, dtype in arrays)
+    there = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else needed
+    if needed > there:
+        raise ValueError(f"its arrays claim {needed / 2**30:.3g} GiB, this machine has {there / 2**30:.3g}")
 
 
 def first_line(error: Exception) -> str:

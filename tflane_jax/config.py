@@ -145,7 +145,10 @@ def _load_config(name: str, ablation: str) -> RunConfig:
 
 
 def with_reference_batch(config: RunConfig, chosen: RunConfig) -> RunConfig:
-    """Return a configuration whose learning rate is scaled, if it is, from the batch of the one it was chosen for."""
+    """Return a configuration with `optim.reference_batch`: the batch size of `chosen`, for which its rate was chosen.
+
+    Unchanged without `optim.lr_scaling`, or where the setting is given.
+    """
     if not (isinstance(config.optim, OptimConfig) and isinstance(chosen.training, TrainingConfig)):
         return config  # of a file; its check names the type
     if config.optim.lr_scaling == "none" or config.optim.reference_batch is not None:
@@ -177,25 +180,23 @@ def with_same_examples(config: RunConfig, chosen: RunConfig, given: Collection[s
     def divided(number: int) -> int:
         return -(-number * before // after)
 
-    def fitted(number: int) -> int:
-        warmup = config.optim.warmup_steps
-        steps = config.training.steps if stays("training.steps") else change("training.steps", chosen.training.steps)
-        if min(steps, chosen.training.steps) <= warmup:  # an error, told where the schedule is made
-            return divided(number)
-        return max(number * (steps - warmup) // (chosen.training.steps - warmup), 1)
-
     epoch = chosen.optim.epoch_steps
     new_epoch = config.optim.epoch_steps if stays("optim.epoch_steps") else divided(epoch)
 
     def change(name: str, number: int) -> int:
         if stays(name):
             return number
-        if epoch > 0 and new_epoch > 0 and number % epoch == 0:
-            return number // epoch * new_epoch
-        fits = config.optim.restarts is not None and config.optim.restarts.last_cycle == "fit"
-        return fitted(number) if fits and name == "optim.restarts.cycle_steps" else divided(number)
+        is_whole_epochs = epoch > 0 and new_epoch > 0 and number % epoch == 0
+        return number // epoch * new_epoch if is_whole_epochs else divided(number)
 
-    return with_step_counts(config, change)
+    changed, restarts, warmup = with_step_counts(config, change), config.optim.restarts, config.optim.warmup_steps
+    if restarts is None or restarts.last_cycle == "cut" or stays("optim.restarts.cycle_steps"):
+        return changed
+    old_steps, new_steps = chosen.training.steps, changed.training.steps
+    if min(old_steps, new_steps) <= warmup:  # an error, told where the schedule is made
+        return changed
+    cycle_steps = max(restarts.cycle_steps * (new_steps - warmup) // (old_steps - warmup), 1)
+    return with_setting(changed, "optim.restarts.cycle_steps", cycle_steps)
 
 
 def with_step_counts(config: RunConfig, change: Callable[[str, int], int]) -> RunConfig:

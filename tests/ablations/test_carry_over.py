@@ -85,7 +85,7 @@ def test_folds_leave_out_several_logs_at_a_time(folder):
     def planned(**other):
         wanted = settings(folder, **other)
         return plans.with_trainings(
-            plans.recorded_logs(wanted), wanted, plans.model_configs(wanted), folder, {"cores": 1}
+            plans.plan_without_trainings(wanted), wanted, plans.model_configs(wanted), folder, {"cores": 1}
         )
 
     plan, alone = planned(folds=2), planned()
@@ -185,7 +185,9 @@ def test_other_generated_roads_are_no_part_of_an_earlier_comparison(folder, monk
     wanted, out = settings(folder), folder / "out"
 
     def planned():
-        plan = plans.with_trainings(plans.recorded_logs(wanted), wanted, plans.model_configs(wanted), out, {"cores": 1})
+        plan = plans.with_trainings(
+            plans.plan_without_trainings(wanted), wanted, plans.model_configs(wanted), out, {"cores": 1}
+        )
         return {job.folder for job in plan.flat()}
 
     before = planned()
@@ -228,7 +230,7 @@ def test_other_files_of_the_maps_are_other_runs(folder):
             carry_over(settings(folder), folder / "out")
         configs = plans.model_configs(settings(folder))
         plan = plans.with_trainings(
-            plans.recorded_logs(settings(folder)), settings(folder), configs, folder / "out", {"cores": 1}
+            plans.plan_without_trainings(settings(folder)), settings(folder), configs, folder / "out", {"cores": 1}
         )
         assert not any(job.exists() for job in plan.flat())
     finally:

@@ -36,11 +36,12 @@ def test_a_worker_that_is_killed_is_named_by_its_run(tmp_path):
         worker.begin(job)
         worker._process.kill()
         worker._process.join()
-        failure = worker.check()
+        done = worker.poll()
         assert worker.job is None
-    assert failure is not None
-    assert re.search(r"seed_0 failed: its messages are in .*seed_0\.log", str(failure))
-    assert "killed by SIGKILL" in str(failure)
+    assert done is not None
+    assert done.job is job
+    assert re.search(r"seed_0 failed: its messages are in .*seed_0\.log", str(done.failure))
+    assert "killed by SIGKILL" in str(done.failure)
     assert "killed by SIGKILL" in job.log.read_text()
 
 
@@ -62,14 +63,9 @@ def test_a_configuration_that_cannot_be_sent_is_an_error_and_leaves_the_worker_f
 def test_runs_that_are_trained_anew_count_from_their_beginning(tmp_path, monkeypatch):
     """Regression: the bar showed the steps of the runs that were to be deleted."""
     jobs = [Job(CONFIG, tmp_path / name, retrain=True) for name in ("other", "same")]
-    starts = {"other": "overwrite", "same": "resume"}
-    monkeypatch.setattr(Job, "start", lambda job: starts[job.folder.name])
     monkeypatch.setattr(Job, "step", lambda job: 2)
-    anew = {job.place for job in jobs if job.start() == "overwrite"}
-    assert workers._steps(jobs, jobs[1:], anew) == 2
-    assert workers._steps(jobs, jobs, anew) == 2
-    starts["other"] = "new"
-    assert workers._steps(jobs, jobs, anew) == 4
+    assert workers._steps(jobs, {jobs[0].place}) == 2
+    assert workers._steps(jobs, set()) == 4
 
 
 def test_all_workers_are_told_to_end_before_one_is_waited_for(tmp_path, monkeypatch):
@@ -104,7 +100,7 @@ def test_workers_tell_their_stage_and_end_at_once(tmp_path, monkeypatch, stage):
     with Worker([]) as worker:
         worker.begin(job)
         while worker.stage != f" ({stage})":
-            assert worker.check() is None
+            assert worker.poll() is None
         asked = time.perf_counter()
     assert time.perf_counter() - asked < 10  # left with a job, it is told to stop
     assert worker._process.exitcode == 128 + signal.SIGTERM

@@ -228,10 +228,10 @@ def test_other_code_and_packages_are_told_at_a_resume(tmp_path, capsys):
 def test_a_checkpoint_is_identified_by_its_content(tmp_path):
     def content(name, **others):
         run(tmp_path / name, config=dataclasses.replace(CONFIG, steps=4), **others)
-        return Checkpoints(tmp_path / name / "checkpoints").content(4)
+        return Checkpoints(tmp_path / name / "checkpoints").digest(4)
 
     first = content("one")
-    assert first == Checkpoints(tmp_path / "one" / "checkpoints").content(4)
+    assert first == Checkpoints(tmp_path / "one" / "checkpoints").digest(4)
     moved = {"x": line_arrays()["x"] + np.float32(1), "y": line_arrays()["y"]}
     assert content("other", arrays=moved) != first
 

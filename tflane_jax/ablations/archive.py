@@ -168,7 +168,7 @@ def write_archive(path: Path, archive: Archive) -> Path:
     packed = gzip.compress(text, 9, mtime=0)
     if len(packed) > LARGEST_FILE or len(text) > LARGEST_TEXT:
         raise UserError(f"cannot write {path}: it would be too large for a record of scores, {len(text):,} bytes")
-    _archive(json.loads(text), path)
+    _parsed(json.loads(text), path)  # raises for what `read_archive` would refuse
     return write_bytes(path, packed)
 
 
@@ -180,7 +180,7 @@ def write_archive(path: Path, archive: Archive) -> Path:
 def read_archive(path: Path) -> Archive:
     """Return a record; raises UserError, which names the file and the place in it, for anything that is wrong."""
     try:
-        return _archive(parse_json(_text_of(path), str(path), "record of scores"), path)
+        return _parsed(parse_json(_text_of(path), str(path), "record of scores"), path)
     except RecursionError:
         raise UserError(f"{path} is no record of scores: its lists are nested too deep") from None
     except UserError as error:
@@ -209,7 +209,7 @@ def _text_of(path: Path) -> str:
         raise UserError(f"{path} is no record of scores: it is not text") from None
 
 
-def _archive(content: Any, path: Path) -> Archive:
+def _parsed(content: Any, path: Path) -> Archive:
     where = str(path)
     if (version := member(content, "format", where)) != FORMAT:
         raise UserError(f"{where} has format {shown(version)}, this version of tflane_jax reads {FORMAT}")

@@ -29,7 +29,7 @@ from tflane_jax.ablations.carry_over_plan import (
     Settings,
     model_configs,
     on_log,
-    recorded_logs,
+    plan_without_trainings,
     with_trainings,
 )
 from tflane_jax.ablations.comparison import Scores, compact
@@ -98,9 +98,9 @@ def carry_over(settings: Settings, out: Path) -> Path:
     )
     declaration = Declaration(PRIMARY, claims)
     check(declaration, configs)
-    folder = recorded_logs(settings)
-    content = {**folder.content, **({} if settings.folds is None else {"folds": str(settings.folds)})}
-    plan = with_trainings(folder, settings, configs, out, worker_threads(settings.jobs, settings.cores))
+    untrained = plan_without_trainings(settings)
+    content = {**untrained.content, **({} if settings.folds is None else {"folds": str(settings.folds)})}
+    plan = with_trainings(untrained, settings, configs, out, worker_threads(settings.jobs, settings.cores))
     by_row = plan.by_row()
     check_rows(by_row)
     declared = declare(declaration, by_row, configs, settings.seeds, out, logs=plan.logs, content=content)
@@ -114,7 +114,7 @@ def carry_over(settings: Settings, out: Path) -> Path:
     )
 
     def replan(threads: Mapping[str, Any]) -> list[Job]:
-        return with_trainings(folder, settings, configs, out, threads).flat()
+        return with_trainings(untrained, settings, configs, out, threads).flat()
 
     for line in runs_elsewhere(plan.flat(), out / "runs", replan):
         print(line, flush=True)

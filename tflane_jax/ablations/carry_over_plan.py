@@ -137,8 +137,8 @@ def map_data(config: RunConfig) -> RealMapData:
     return config.data
 
 
-def recorded_logs(settings: Settings) -> Plan:
-    """Return the plan without trainings; raise UserError where logs are missing."""
+def plan_without_trainings(settings: Settings) -> Plan:
+    """Return the logs of a folder as a plan that has no trainings yet; raise UserError where logs are missing."""
     maps = find_maps(settings.maps)
     names = tuple(one.name for one in maps if one.recorded)
     if len(names) < 2:
@@ -153,10 +153,10 @@ def recorded_logs(settings: Settings) -> Plan:
 
 
 def with_trainings(
-    folder: Plan, settings: Settings, configs: Mapping[str, RunConfig], out: Path, threads: Mapping[str, Any]
+    untrained: Plan, settings: Settings, configs: Mapping[str, RunConfig], out: Path, threads: Mapping[str, Any]
 ) -> Plan:
-    """Return the plan of a folder with its trainings."""
-    plan, store = replace(folder, jobs={}), out / "runs"
+    """Return a plan of `plan_without_trainings` with its trainings."""
+    plan, store = replace(untrained, jobs={}), out / "runs"
     content = hashlib.sha256(json.dumps(plan.content, sort_keys=True).encode()).hexdigest()
     for row, config in configs.items():
         data = map_data(config)

@@ -34,7 +34,7 @@ def given_hashes(job: Job) -> tuple[str, ...]:
     if job.recorded is not None:
         return job.recorded.facts.gives
     try:
-        (own,) = origins(str(job.folder), job.config.training.seeds, read=True)
+        (own,) = origins(str(job.folder), job.config.training.seeds, hash_parameters=True)
     except UserError:  # without checkpoints any more, it can still be measured from its kept scores
         return ()
     return own["parameters"], own["content"]

@@ -37,13 +37,17 @@ def train_and_evaluate(
     Returns:
         The runs that were trained and evaluated, and the failures of the others.
     """
-    return evaluate_others(plan, train_all(order, jobs), results)
+    return evaluate_and_note(plan, train_all(order, jobs), results)
 
 
-def evaluate_others(
+def evaluate_and_note(
     plan: Mapping[str, Sequence[Job]], failures: Sequence[Failure], results: Results
 ) -> tuple[dict[str, list[Job]], list[Failure]]:
-    """Add the scores of all runs but those that failed, and why these did, to the results; return both."""
+    """Add to the results the scores of the runs that did not fail, and for other models why their first run failed.
+
+    Returns:
+        The runs that have scores, by model, and all failures: those given, then those of the evaluation.
+    """
     failures = [*failures, *evaluate_runs(without_failures(plan, failures), results)]
     results.failed.update(reasons(plan, failures))
     return without_failures(plan, failures), failures
@@ -159,7 +163,10 @@ def summary_of(failures: Sequence[Failure], count: int) -> str:
 
 
 def measured_elsewhere(runs: Sequence[Job]) -> list[str]:
-    """Return by which states of the code runs were measured, in words: by other ones, recorded runs by any."""
+    """Return a phrase that names the digests of other code by which runs were measured; [] for none.
+
+    The code of a recorded run is always named.
+    """
     found = [(job, measure(job, config, which)) for job in runs for config, which in evaluations(job)]
     codes = {
         measured.code[:9]

@@ -48,7 +48,8 @@ def search_rates(table: PaperTable, out: Path, *, jobs: int = 1, cores: int | No
     """
     plan = plan_search(table, out, jobs=jobs, cores=cores, quick=quick)
     assert table.search is not None
-    every = seed_by_seed({f"{row}, {rate}": jobs for row, by_rate in plan.items() for rate, jobs in by_rate.items()})
+    by_name = {f"{row}, {rate}": runs for row, by_rate in plan.items() for rate, runs in by_rate.items()}
+    every = seed_by_seed(by_name)
     print(f"{table.name}: {counted(len(every), 'training')} for the learning rates of {len(plan)} rows", flush=True)
     failures = train_all(every, jobs, cores)
     rows = rated(table.search, plan)

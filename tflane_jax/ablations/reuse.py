@@ -122,14 +122,16 @@ def with_recorded(
     by_device: dict[Any, list[Plan]] = {}
     for plan in plans:
         by_device.setdefault(_device(next(iter(plan.values()))[0]), []).append(plan)
-    of_each = (chosen(same) for same in by_device.values())  # that of this process first
     if finished:
-        of_each = [found for found in of_each if device in (None, _kind(next(iter(found.values()))[0]))]
-        if not of_each:
+        wanted = [same for same in by_device.values() if device in (None, _kind(next(iter(same[0].values()))[0]))]
+        if not wanted:
             raise UserError(f"no run of {archive.table} on a {device} is known: leave --device out, or name its record")
-        return max(of_each, key=lambda found: _tested(found, declaration.claims))
+        return max(map(chosen, wanted), key=lambda found: _tested(found, declaration.claims))
     found = chosen(plans)
-    return found if len({_device(job) for jobs in found.values() for job in jobs}) == 1 else next(of_each)
+    if len({_device(job) for jobs in found.values() for job in jobs}) == 1:
+        return found
+    of_this_process, *_ = by_device.values()  # its plans come first
+    return chosen(of_this_process)
 
 
 def _from_one_host(candidates: Mapping[str, Sequence[Sequence[Job]]]) -> dict[str, list[Job]]:
@@ -276,7 +278,7 @@ class InterimRecord:
         curves: Collection[str],
     ) -> None:
         self._path, self._table, self._declaration = path, table, declaration
-        _there(path)
+        _recorded_before(path)  # raises before the trainings if the file is damaged
         self._kept = scores, curves
         # Of equal rows, the first names the run, as in `archive_of`.
         self._rows = {job.folder: name for name, jobs in reversed([*plan.items()]) for job in jobs}
@@ -300,11 +302,11 @@ def add_to_record(path: Path, archive: Archive) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.with_name(f"{path.name}.lock").open("w") as lock:
         take(lock, wait=True)
-        there = _there(path)
+        there = _recorded_before(path)
         write_archive(path, archive if there is None else merged(there, archive))
 
 
-def _there(path: Path) -> Archive | None:
+def _recorded_before(path: Path) -> Archive | None:
     return read_archive(path) if path.exists() else None
 
 

@@ -155,7 +155,7 @@ def _checkpoint(job: Job, config: RunConfig, which: Which) -> tuple[int, dict[st
         "own modules": own_content(config),
     }
     return step, {
-        "checkpoint": checkpoints.content(step),
+        "checkpoint": checkpoints.digest(step),
         "source": repr(source),
         "evaluation": to_json(config.evaluation),
         **{name: content for name, content in further.items() if content},

@@ -31,7 +31,7 @@ from tflane_jax.ablations.findings import findings, save_effects
 from tflane_jax.ablations.finished_runs import (
     commits,
     draw_models,
-    evaluate_others,
+    evaluate_and_note,
     first_models,
     measured_elsewhere,
     save_plan,
@@ -202,9 +202,9 @@ def finish_table(run: TableRun, failures: Sequence[Failure]) -> Path:
     table, planned, folder, quick = run.table, run.planned, run.folder, run.quick
     configs, plan = planned.rows, planned.jobs
     results, own = Results(tuple(configs), tuple(planned.seeds()), {}), {job.folder for job in planned.every()}
-    waiting = [Failure(job, "not finished") for job in tell_unfinished(planned)] if run.interim is None else []
-    told = waiting or [failure for failure in failures if failure.job.folder in own]
-    trained, failures = evaluate_others(plan, told, results)
+    unfinished = [Failure(job, "not finished") for job in tell_unfinished(planned)] if run.interim is None else []
+    known = unfinished or [failure for failure in failures if failure.job.folder in own]
+    trained, failures = evaluate_and_note(plan, known, results)
     _add_geometric(trained, results)
     save_plan(plan, failures, results, folder)
     if not results.scores:
@@ -224,7 +224,7 @@ def finish_table(run: TableRun, failures: Sequence[Failure]) -> Path:
         _draw_curves(table, trained, folder / "curves.png")
     _save_summary(table, run.declared, results, trained, tested, folder, quick=quick)
     print(f"\n{table.name}: {folder} has tables, tests, curves and pictures ({time.monotonic() - run.began:.0f} s)")
-    if failed := failures[len(waiting) :]:
+    if failed := [failure for failure in failures if failure not in unfinished]:
         raise UserError(summary_of(failed, len(planned.every())))
     return path
 

@@ -12,9 +12,9 @@ import signal
 import sys
 import time
 import traceback
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from tflane_jax import accelerators
 from tflane_jax.ablations.cores import cores_each, cores_of_workers
@@ -130,10 +130,10 @@ def _train_in_workers(
         shares = stack.enter_context(cores_of_workers(min(parallel, len(queue)), cores_each(parallel, cores)))
         workers = [stack.enter_context(Worker(share, slot, len(shares))) for slot, share in enumerate(shares)]
         stack.callback(lambda: [worker.end() for worker in workers])  # before any of them is waited for
-        total, done = sum(job.config.training.steps for job in jobs), sum(job.resumes_at() for job in jobs)
+        total, made = sum(job.config.training.steps for job in jobs), sum(job.resumes_at() for job in jobs)
         anew = {job.place for job in jobs if job.start() == "overwrite"}  # their folders hold records of other runs
         bar = stack.enter_context(
-            progress_bar(total=total, initial=done, desc=f"train and measure {counted(len(jobs), 'run')}", unit="step")
+            progress_bar(total=total, initial=made, desc=f"train and measure {counted(len(jobs), 'run')}", unit="step")
         )
         while len(queue) or any(worker.job for worker in workers):
             for worker in workers:
@@ -148,31 +148,24 @@ def _train_in_workers(
                     _tell([failure for failure in failures if failure.job is chosen])
             time.sleep(_POLL_SECONDS)
             bar.set_postfix_str(_running(workers, queue), refresh=False)
-            training = [worker.job for worker in workers if worker.job is not None]
-            bar.update(_steps(jobs, [*training, *queue.elsewhere], anew) - bar.n)
+            begun = [*(worker.job for worker in workers if worker.job is not None), *queue.elsewhere]
+            anew -= {job.place for job in begun if job.start() != "overwrite"}
+            bar.update(_steps(jobs, anew) - bar.n)
             for worker in workers:
-                job = worker.job
-                if (failure := worker.check()) is not None:
-                    failures.append(failure)
-                    _tell([failure])
-                if job is not None and worker.job is None:
-                    if failure is None and finished is not None:
-                        with noted(job, failures):
-                            finished(job)
-                    queue.done(job)
+                if (done := worker.poll()) is None:
+                    continue
+                if done.failure is not None:
+                    failures.append(done.failure)
+                    _tell([done.failure])
+                elif finished is not None:
+                    with noted(done.job, failures):
+                        finished(done.job)
+                queue.done(done.job)
     return failures
 
 
-def _steps(jobs: Sequence[Job], begun: Sequence[Job], anew: set[Path]) -> int:
-    """Return the updates that all runs have made.
-
-    Args:
-        jobs: of the comparison.
-        begun: those that are being trained.
-        anew: places of runs that are trained anew, whose folders hold records of other runs until they begin; those
-            that have begun are taken out.
-    """
-    anew -= {job.place for job in begun if job.start() != "overwrite"}
+def _steps(jobs: Sequence[Job], anew: Collection[Path]) -> int:
+    """Return the updates that all runs have made; the folders of `anew` still hold the records of other runs."""
     return sum(job.step() for job in jobs if job.place not in anew)
 
 
@@ -195,6 +188,13 @@ def _build(job: Job, built: set[Any]) -> None:
         if (source := job.config.data.source(split)) not in built:
             build_data(source)
             built.add(source)
+
+
+class Done(NamedTuple):
+    """A job that a worker has finished, and why it failed; None if it did not."""
+
+    job: Job
+    failure: Failure | None
 
 
 class Worker:
@@ -246,7 +246,7 @@ class Worker:
         try:
             self._pipe.send(job)
         except OSError:
-            pass  # a process that is gone is found by `check`
+            pass  # a process that is gone is found by `poll`
         except Exception as error:
             self.job = None
             raise UserError(
@@ -254,8 +254,11 @@ class Worker:
                 "functions at the top level of a module, or leave out --jobs and --cores"
             ) from error
 
-    def check(self) -> Failure | None:
-        """Return why the current job failed, if it did; a process that is gone is replaced when the next job begins."""
+    def poll(self) -> Done | None:
+        """Read what the process has told; return the current job, and forget it, once it is done.
+
+        A process that is gone is replaced when the next job begins.
+        """
         while self.job is not None and self._pipe.poll():
             try:
                 what, text = self._pipe.recv()
@@ -265,7 +268,7 @@ class Worker:
                 _log(self.job, f"tflane: {text}")
             if what == "done":
                 job, self.job = self.job, None
-                return None if text is None else Failure(job, text)
+                return Done(job, None if text is None else Failure(job, text))
             self.stage = f" ({text})" if text else ""
         return None
 

@@ -70,37 +70,32 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> int:
 
 
 def _check_together(options: argparse.Namespace) -> None:
-    """Raise UserError for options that do nothing together; fill in the defaults of --plan."""
-    given = {
-        "--kind": options.kind is not None,
-        "--utilisation": options.utilisation is not None,
-        "--depth": options.depth is not None,
-        "--no-training": options.no_training,
-    }
-    of_plan = ("--kind", "--utilisation")
-    for name, is_given in given.items():
-        if is_given and (options.plan is None) == (name in of_plan):
-            remedy = "add it" if name in of_plan else f"leave {name} or --plan out"
-            raise UserError(f"{name} does nothing {'without' if name in of_plan else 'with'} --plan: {remedy}")
+    """Raise UserError for options that do nothing together."""
+    of_plan = {"--kind": options.kind is not None, "--utilisation": options.utilisation is not None}
+    of_tables = {"--depth": options.depth is not None, "--no-training": options.no_training}
+    idle = [name for name, is_given in (of_plan if options.plan is None else of_tables).items() if is_given]
+    if idle and options.plan is None:
+        raise UserError(f"{idle[0]} does nothing without --plan: add it")
+    if idle:
+        raise UserError(f"{idle[0]} does nothing with --plan: leave {idle[0]} or --plan out")
     if options.depth is not None and options.depth < 1:
         raise UserError(f"--depth {options.depth}: at least one level of names")
-    options.kind = options.kind or "h100"
-    options.utilisation = UTILISATION if options.utilisation is None else options.utilisation
 
 
 def _plan(options: argparse.Namespace, config: RunConfig, example: Any) -> int:
+    kind = options.kind or "h100"
     plan = make_plan(
         config.task,
         example,
         config.optim,
         config.training,
         devices=options.plan,
-        kind=options.kind,
-        utilisation=options.utilisation,
+        kind=kind,
+        utilisation=UTILISATION if options.utilisation is None else options.utilisation,
         compiled=not options.no_compile,
     )
     title = f"Estimate, not a measurement: {options.config or 'the default configuration'} on {options.plan} x "
-    title += f"{options.kind}, batch {config.training.batch_size}"
+    title += f"{kind}, batch {config.training.batch_size}"
     print(format_table(plan.rows, title=title))
     print("\nAssumptions\n" + "\n".join(f"- {sentence}" for sentence in plan.assumptions))
     if options.out is not None:

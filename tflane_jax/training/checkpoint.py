@@ -208,7 +208,7 @@ class Checkpoints:
             raise self._damaged(step, "it has no averaged parameters")
         return unflatten_dict(averaged, sep="/")
 
-    def content(self, step: int) -> str:
+    def digest(self, step: int) -> str:
         """Return a hash of a checkpoint's arrays and of the configuration that it was made with."""
         manifest = self.manifest(step)
         text = json.dumps([manifest.step, manifest.files, manifest.config], sort_keys=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -61,8 +62,9 @@ def check_origin_params(
     With the configuration (JSON) of the new run, `resolved`, the message names both models if their classes differ.
     """
     for folder, seed in zip(origin_folders(reference, seeds), seeds, strict=True):
-        kinds = _kind(migrate(read_config(folder))[0]), _kind(resolved)
-        _differences(folder, _saved(folder, seed), flat(shapes), partly=partly, frozen=frozen, kinds=kinds)
+        theirs, ours = _kind(migrate(read_config(folder))[0]), _kind(resolved)
+        saved, wanted = _saved(folder, seed), flat(shapes)
+        _differences(folder, saved, wanted, partly=partly, frozen=frozen, theirs=theirs, ours=ours)
 
 
 def check_origins(reference: str, seeds: Sequence[int]) -> None:
@@ -77,17 +79,18 @@ def check_origins(reference: str, seeds: Sequence[int]) -> None:
             raise UserError(f"training.init_from is {reference}: {error}; {remedy}") from error
 
 
-def origins(reference: str, seeds: Sequence[int], *, read: bool = False) -> list[dict[str, Any]]:
-    """Return folder, step, seed and content of the checkpoint that each seed starts from, see `starting_params`.
+def origins(reference: str, seeds: Sequence[int], *, hash_parameters: bool = False) -> list[dict[str, Any]]:
+    """Return folder, step, seed and "content" of the checkpoint that each seed starts from, see `starting_params`.
 
-    "content" is a hash of its files, which differ between equal trainings; with `read`, "parameters" is one of values.
+    "content" is a hash of the checkpoint's files, in which two equal trainings differ. With `hash_parameters`, which
+    reads the arrays, "parameters" is a hash of their values; equal trainings have the same.
     """
     found = []
     for folder, seed in zip(origin_folders(reference, seeds), seeds, strict=True):
         checkpoints, step, theirs = _starting_checkpoint(folder)
         place = {"run": str(folder), "step": step, "seed": theirs[_place(seed, theirs)]}
-        values = {"parameters": _digest(checkpoints.params(step))} if read else {}
-        found.append(place | {"content": checkpoints.content(step)} | values)
+        values = {"parameters": _digest(checkpoints.params(step))} if hash_parameters else {}
+        found.append(place | {"content": checkpoints.digest(step)} | values)
     return found
 
 
@@ -134,6 +137,14 @@ def _saved(folder: Path, seed: int) -> dict[str, Any]:
     return flat(per_seed(checkpoints.params(step), seeds)[_place(seed, seeds)])
 
 
+@dataclass(frozen=True)
+class _Kind:
+    """Names of the classes of a task and of its model; "" where they are not known."""
+
+    task: str = ""
+    model: str = ""
+
+
 def _differences(
     folder: Path,
     saved: Mapping[str, Any],
@@ -141,7 +152,8 @@ def _differences(
     *,
     partly: bool,
     frozen: Sequence[str],
-    kinds: tuple[_Kind, _Kind] = (("", ""), ("", "")),
+    theirs: _Kind = _Kind(),
+    ours: _Kind = _Kind(),
 ) -> tuple[list[str], list[str]]:
     """Return the names of parameters that only the new model has, and only the run's; raise UserError for a misfit.
 
@@ -149,13 +161,13 @@ def _differences(
         folder: of the run to start from.
         saved, wanted: its parameters and those of the new model, by name.
         partly, frozen: see `starting_params`.
-        kinds: of the run and of the new one, where they are known.
+        theirs, ours: classes of the run and of the new one, where they are known.
     """
-    (their_task, theirs), (our_task, ours) = kinds
     other = f"training.init_from: {folder} holds another model"
     instead = ""
-    if theirs and theirs != ours:
-        other, instead = f"training.init_from: {folder} is a run of {theirs}, not of {ours}", f": name a run of {ours}"
+    if theirs.model and theirs.model != ours.model:
+        other = f"training.init_from: {folder} is a run of {theirs.model}, not of {ours.model}"
+        instead = f": name a run of {ours.model}"
     for name in sorted(saved.keys() & wanted.keys()):
         if _shape(saved[name]) != _shape(wanted[name]):
             raise UserError(f"{other} ({name}: {_shape(saved[name])} there, {_shape(wanted[name])} here){instead}")
@@ -165,7 +177,7 @@ def _differences(
     if (added or dropped) and not partly:
         where = "is only here" if added else "is only there"
         total, common = _count(wanted, wanted), _count(wanted, wanted.keys() - set(added))
-        if their_task == our_task:
+        if theirs.task == ours.task:
             fraction = f"{common:,} of {total:,} parameters ({100 * common / total:.0f} %)"
             instead += f"; training.init_partly takes over the {fraction} that both have"
             if added:
@@ -179,14 +191,10 @@ def _differences(
     return added, dropped
 
 
-_Kind = tuple[str, str]
-"""Names of the classes of a task and of its model; "" where they are not known."""
-
-
 def _kind(config: dict[str, Any]) -> _Kind:
     """Return the classes that a configuration (JSON) names."""
     task, model = (value_at(config, name) for name in ("task.class", "task.model.class"))
-    return (task, model) if isinstance(task, str) and isinstance(model, str) else ("", "")
+    return _Kind(task, model) if isinstance(task, str) and isinstance(model, str) else _Kind()
 
 
 def _count(params: Mapping[str, Any], names: Iterable[str]) -> int:

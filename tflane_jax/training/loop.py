@@ -213,7 +213,7 @@ def train(
                     [state.params for state in fresh],
                 )
             states = [state_of(params, optimizer, s.key) for params, s in zip(given, states, strict=True)]
-            started_from["init_from"] = from_first(lambda: origins(origin, config.seeds, read=True))
+            started_from["init_from"] = from_first(lambda: origins(origin, config.seeds, hash_parameters=True))
         place = partial(placed, mesh=mesh, shard=config.shard_state)
         states = [place(state) for state in states]
         first = step = int(states[0].step)

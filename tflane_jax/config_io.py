@@ -92,15 +92,15 @@ def subclasses(kind: type) -> dict[str, type]:
     while waiting:
         each = waiting.pop(0)
         waiting += [c for c in each.__subclasses__() if c.__module__ in sys.modules]  # others: the import has failed
-        shipped = found.get(each.__name__)
-        if shipped is each:
+        earlier = found.get(each.__name__)
+        if earlier is each:
             continue
-        if shipped is not None and shipped.__module__.startswith("tflane_jax."):
+        if earlier is not None and earlier.__module__.startswith("tflane_jax."):
             raise UserError(
                 f"class {each.__name__} of {each.__module__} is called like one of tflane_jax: give it another name, "
                 "because runs are read back by it"
             )
-        if shipped is not None and (file := _file_of(each)) != (other := _file_of(shipped)):
+        if earlier is not None and (file := _file_of(each)) != (other := _file_of(earlier)):
             raise UserError(
                 f"class {each.__name__} is defined in {other} and in {file}: give one another name, because runs are "
                 "read back by it"

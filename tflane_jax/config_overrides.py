@@ -57,8 +57,8 @@ def apply_overrides(config: RunConfig, arguments: Sequence[str]) -> RunConfig:
         return config
     import tyro
 
-    given, names = config, {_setting(argument) for argument in arguments} - {""}
-    config, arguments = _choose_parts(config, arguments)
+    before, names = config, {_setting(argument) for argument in arguments} - {""}
+    config, arguments = _choose_parts(before, arguments)
     kind, default = _with_only(config, _checked_names(config, arguments))
     output = io.StringIO()
     try:
@@ -66,7 +66,8 @@ def apply_overrides(config: RunConfig, arguments: Sequence[str]) -> RunConfig:
             parsed = tyro.cli(kind, default=default, args=list(arguments), config=(tyro.conf.AvoidSubcommands,))
     except SystemExit as error:
         raise UserError(_without_boxes(output.getvalue(), config)) from error
-    changed = with_same_examples(with_reference_batch(_merged(config, parsed), given), given, names)
+    changed = with_reference_batch(_merged(config, parsed), before)
+    changed = with_same_examples(changed, before, names)
     check_settings(changed, "--")
     return changed
 

@@ -100,29 +100,30 @@ def make_plan(
     Raises:
         UserError: the batch cannot be shared, or a number is out of range.
     """
-    part = _share_of_a_pass(training, devices, utilisation)
+    _check_range(devices, utilisation)
+    per_pass = _examples_per_pass(training, devices)
     device, optim = ACCELERATORS[kind], scaled_to_batch(optim, training.batch_size)
-    program = training_program(task, example, part, optim, compiled=compiled)
+    program = training_program(task, example, per_pass, optim, compiled=compiled)
     frames = example if task.frames == 1 else shapes_of(example, task.frames)
     state: Any = jax.eval_shape(
         partial(init_state, task, make_optimizer(optim, any_steps(optim))), jax.random.key(0), frames
     )
-    batch = _gib(shapes_of(frames, part * training.accumulate))
-    parts = _memory(state, batch, program, training, devices)
-    memory = None if None in parts.values() else sum(value for value in parts.values() if value is not None)
+    batch = _gib(shapes_of(frames, per_pass * training.accumulate))
+    by_use = _memory(state, batch, program, training, devices)
+    memory = None if None in by_use.values() else sum(value for value in by_use.values() if value is not None)
 
-    shared, learned, half = _is_sharded(training, devices), _gib(state.learned), _in_bfloat16(task)
-    peak = device.bfloat16 if half else device.float32
+    sharded, learned, bfloat16 = _is_sharded(training, devices), _gib(state.learned), _in_bfloat16(task)
+    peak = device.bfloat16 if bfloat16 else device.float32
     operations = program.gflop * training.accumulate
     compute = operations / (1e3 * peak * utilisation)
-    exchange = (3 if shared else 2) * (devices - 1) / devices * learned * GIB / (1e9 * device.link)
+    exchange = (3 if sharded else 2) * (devices - 1) / devices * learned * GIB / (1e9 * device.link)
     step = compute + exchange
     rows = {
-        **{f"memory: {name}, GiB": _number(value) for name, value in parts.items()},
+        **{f"memory: {name}, GiB": _number(value) for name, value in by_use.items()},
         f"memory of a device, GiB (it has {device.memory * 1e9 / GIB:.0f})": _number(memory),
         "operations of a step on a device, GFLOP": f"{operations:,.0f}",
         "computing, s a step": _number(compute),
-        f"exchange of gradients{' and parameters' if shared else ''}, s a step": _number(exchange),
+        f"exchange of gradients{' and parameters' if sharded else ''}, s a step": _number(exchange),
         "time of a step, s": _number(step),
         "examples a second, all devices": f"{training.batch_size / step:,.1f}" if step else "-",
         f"time of {training.steps:,} steps, hours": _number(step * training.steps / 3600),
@@ -130,14 +131,14 @@ def make_plan(
     return Plan(
         tuple({"estimate": name, "value": value} for name, value in rows.items()),
         (
-            f"{kind}: {device.memory:g} GB, {peak:g} TFLOP/s of {'bfloat16' if half else 'float32 (TF32)'} products, "
-            f"{device.link:g} GB/s to the others; peak numbers of the data sheet",
+            f"{kind}: {device.memory:g} GB, {peak:g} TFLOP/s of {'bfloat16' if bfloat16 else 'float32 (TF32)'} "
+            f"products, {device.link:g} GB/s to the others; peak numbers of the data sheet",
             f"computing reaches {utilisation:.0%} of the peak (--utilisation); measured for single examples of "
             f"LaneSegNet and MapTRv2 in bfloat16 on an H200: {UTILISATION:.0%}",
             "operations are XLA's count before fusion; frames of a clip and parts of a batch all count",
             "gradients and activations need what the compiler for this machine plans; a GPU's plan differs",
             "gradients are exchanged after computing, in a ring, at full speed of the link",
-            *(("gathering what Muon needs whole takes neither memory nor time",) if shared else ()),
+            *(("gathering what Muon needs whole takes neither memory nor time",) if sharded else ()),
             "loading, evaluation, checkpoints and compiling take no time",
         ),
         memory,
@@ -146,12 +147,15 @@ def make_plan(
     )
 
 
-def _share_of_a_pass(training: TrainingConfig, devices: int, utilisation: float) -> int:
-    """Return how many examples pass through the model of one device at once; refuse settings out of range."""
+def _check_range(devices: int, utilisation: float) -> None:
     if devices < 1:
         raise UserError(f"--plan {devices}: at least 1 device")
     if not 0.0 < utilisation <= 1.0:
         raise UserError(f"--utilisation {utilisation:g}: above 0 and at most 1")
+
+
+def _examples_per_pass(training: TrainingConfig, devices: int) -> int:
+    """Return how many examples pass through the model of one device at once; raise UserError for unequal parts."""
     passes = devices * training.accumulate
     if training.batch_size % passes:
         raise UserError(
@@ -169,16 +173,16 @@ def _memory(
     state: TrainState, batch: float, program: Program, training: TrainingConfig, devices: int
 ) -> dict[str, float | None]:
     """Return GiB of one device by what they hold; `batch` is that of its examples, None what was not compiled."""
-    learned, shared = _gib(state.learned), _is_sharded(training, devices)
+    learned, sharded = _gib(state.learned), _is_sharded(training, devices)
     temporary = None if program.temporary is None else program.temporary / 1024
     # Parts add up in a further gradient.
     activations = None if temporary is None else temporary + (learned if training.accumulate > 1 else 0.0)
-    holders = devices if shared else 1
+    holders = devices if sharded else 1
     return {
         "parameters": learned / holders + _gib(state.statistics),
         "their moving average": _gib(state.ema_learned) / holders + _gib(state.ema_statistics),
         "optimizer": _gib(state.opt_state) / holders,
-        **({"parameters, gathered for the loss": learned} if shared else {}),
+        **({"parameters, gathered for the loss": learned} if sharded else {}),
         "batch": batch,
         "gradients and activations": activations,
     }

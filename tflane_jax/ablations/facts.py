@@ -52,15 +52,14 @@ def mixed_hosts(rows: Sequence[TableRow], trained: Mapping[str, Sequence[Job]]) 
     such rows differ in more than what the table compares. Rows whose start is not recorded count as others; a row that
     is the host itself counts as another if it is known to be one.
     """
-    found: dict[str, dict[int, set[tuple[str, ...]]]] = {}
-    for row in rows:
-        for job in trained.get(row.name, ()) if row.start else ():
-            seed = job.seed
-            found.setdefault(row.start, {}).setdefault(seed, set()).add(facts(job).origins)
-    for row in rows:
-        for job in trained.get(row.name, ()) if row.name in found else ():
-            seed = job.seed
-            started, gives = found[row.name].get(seed, set()), given_hashes(job)
+    found: dict[str, dict[int, set[tuple[str, ...]]]] = {row.start: {} for row in rows if row.start}
+    runs = [(row, job) for row in rows for job in trained.get(row.name, ())]
+    for row, job in runs:
+        if row.start:
+            found[row.start].setdefault(job.seed, set()).add(facts(job).origins)
+    for row, job in runs:
+        if row.name in found:  # it is the host itself
+            started, gives = found[row.name].get(job.seed, set()), given_hashes(job)
             if gives and not any(set(gives) & set(of_row) for of_row in started):
                 started.add(gives)
     sentences = []

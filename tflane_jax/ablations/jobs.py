@@ -126,9 +126,8 @@ class Job:
     def _other_files(self) -> str:
         """Return that files of the training data have changed since; "" if they have not, or nothing tells."""
         checkpoints, split = Checkpoints(self.folder / "checkpoints"), self.config.data.source("train")
-        with contextlib.suppress(
-            UserError
-        ):  # files are gone, or the checkpoint is damaged: reported when the run is used
+        # Files are gone, or the checkpoint is damaged: reported when the run is used.
+        with contextlib.suppress(UserError):
             for step in checkpoints.steps()[-1:]:
                 trained_on = checkpoints.manifest(step).progress.get("content")  # earlier versions wrote down none
                 if trained_on and trained_on != source_of(split).content(split):

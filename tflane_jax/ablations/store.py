@@ -110,8 +110,11 @@ def runs_elsewhere(plan: Sequence[Job], store: Path, replan: Callable[[Mapping[s
         store: folder of the runs.
         replan: returns the same runs, in the same order, as they are called with another thread setting.
     """
-    lines, missing = [], [i for i, job in enumerate(plan) if not job.exists()]
-    for setting in settings_in(store) if missing else ():
+    missing = [i for i, job in enumerate(plan) if not job.exists()]
+    if not missing:
+        return []
+    lines = []
+    for setting in settings_in(store):
         there, here = replan(setting), plan[0].threads
         found = [there[i] for i in missing if there[i].exists()]
         if found:

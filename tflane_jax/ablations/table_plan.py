@@ -154,9 +154,11 @@ def _other_hosts(plan: TablePlan) -> list[str]:
     """Return a notice for each host from which recorded runs and runs to be trained of one seed start."""
     found: dict[str, dict[int, set[bool]]] = {}
     for row in plan.table.rows:
-        for job in plan.jobs[row.name] if row.start else ():
+        if not row.start:
+            continue
+        by_seed = found.setdefault(row.start, {})
+        for job in plan.jobs[row.name]:
             if job.recorded is not None or not job.is_complete():
-                by_seed = found.setdefault(row.start, {})
                 by_seed.setdefault(job.seed, set()).add(job.recorded is not None)
     return [
         f"recorded runs of seed{'s' if len(mixed) > 1 else ''} {', '.join(map(str, mixed))} start from an earlier "

@@ -72,21 +72,8 @@ def find(options: argparse.Namespace) -> int:
         search=options.search,
     )
     check_settings(config, "--")
+    _check_camera(options)
     distortion: list[float] = options.distortion or []
-    if len(distortion) not in (0, 4, 5, 8):
-        raise UserError(f"--distortion takes OpenCV's K1 K2 P1 P2, with K3, or with K3 to K6, not {len(distortion)}")
-    for name in ("intrinsics", "distortion", "height", "pitch"):
-        if not np.isfinite(getattr(options, name) or 0.0).all():
-            raise UserError(f"--{name} takes finite numbers, not nan or inf")
-    if np.abs(distortion).max(initial=0.0) > LARGEST_DISTORTION:
-        raise UserError(f"--distortion holds numbers up to {LARGEST_DISTORTION:g}, not {np.abs(distortion).max():g}")
-    if not 0.0 < options.height <= _HIGHEST:
-        raise UserError(
-            f"--height is that of the camera above the ground, above 0 and up to {_HIGHEST:g} metres, not "
-            f"{options.height:g}"
-        )
-    if not abs(options.pitch) <= 90.0:
-        raise UserError(f"--pitch is from -90 to 90 degrees, not {options.pitch:g}")
     intrinsics, pose = _intrinsics(options.intrinsics), camera_pose(options.height, np.deg2rad(options.pitch))
     pictures = {path: f"{number:03d}-{short_stem(path)}-markers.png" for number, path in enumerate(photos)}
     check_replaces({options.out / name: path for path, name in pictures.items()}, photos)
@@ -106,11 +93,11 @@ def find(options: argparse.Namespace) -> int:
         here = [_record(found, k, intrinsics, pose) for k in np.flatnonzero(found.valid).tolist()]
         twice += _contradictions(path, here)
         records.append({"file": str(path), "picture": picture, "markers": here})
-        places = [dict(zip("xyz", record["position"], strict=True)) for record in here]
-        remarks = [{"remark": "contradictory"} if record["contradictory"] else {} for record in here]
-        rows += [{"photo": path.name} | a | b | c for a, b, c in zip(here, places, remarks, strict=True)] or [
-            {"photo": path.name}
-        ]
+        for record in here:
+            remark = {"remark": "contradictory"} if record["contradictory"] else {}
+            rows.append({"photo": path.name} | record | dict(zip("xyz", record["position"], strict=True)) | remark)
+        if not here:
+            rows.append({"photo": path.name})
     head = {"family": config.family.name, "size": config.size}
     write_json(options.out / "detections.json", head | {"photos": records, "faults": faults})
     columns = ("photo", "id", "score", "distance", "x", "y", "z", "turn", "reprojection", "ambiguity")
@@ -125,6 +112,25 @@ def find(options: argparse.Namespace) -> int:
     if faults:
         print(f"tflane: photos without an answer: {len(faults)} of {len(pictures)}, see above", file=sys.stderr)
     return 2 if faults else 0
+
+
+def _check_camera(options: argparse.Namespace) -> None:
+    """Raise UserError for a distortion, height or pitch that no camera has, and for numbers that are not finite."""
+    distortion: list[float] = options.distortion or []
+    if len(distortion) not in (0, 4, 5, 8):
+        raise UserError(f"--distortion takes OpenCV's K1 K2 P1 P2, with K3, or with K3 to K6, not {len(distortion)}")
+    for name in ("intrinsics", "distortion", "height", "pitch"):
+        if not np.isfinite(getattr(options, name) or 0.0).all():
+            raise UserError(f"--{name} takes finite numbers, not nan or inf")
+    if np.abs(distortion).max(initial=0.0) > LARGEST_DISTORTION:
+        raise UserError(f"--distortion holds numbers up to {LARGEST_DISTORTION:g}, not {np.abs(distortion).max():g}")
+    if not 0.0 < options.height <= _HIGHEST:
+        raise UserError(
+            f"--height is that of the camera above the ground, above 0 and up to {_HIGHEST:g} metres, not "
+            f"{options.height:g}"
+        )
+    if not abs(options.pitch) <= 90.0:
+        raise UserError(f"--pitch is from -90 to 90 degrees, not {options.pitch:g}")
 
 
 def curves(options: argparse.Namespace) -> int:

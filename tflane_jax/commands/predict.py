@@ -15,7 +15,6 @@ from tflane_jax.training.runtime import configure_jax
 # A lane line of LSTR is a query that is more probably a lane than not.
 _OF_LANES, _OF_LANE_LINES = 0.3, 0.5
 _EXAMPLES = 8
-_OF_PHOTOS = "is of photos: name some, or leave it out"
 
 
 def run(options: argparse.Namespace) -> int:
@@ -48,7 +47,10 @@ def run(options: argparse.Namespace) -> int:
 
 def _check_inputs(options: argparse.Namespace, photos: list[Path]) -> None:
     """Raise UserError for options that would have no effect on photos, or without them."""
-    for name in ("split", "data", "root", "openlane", "data_dict", "count") if photos else ("focal", "horizon"):
+    names, reason = ("focal", "horizon"), "is of photos: name some, or leave it out"
+    if photos:
+        names = ("split", "data", "root", "openlane", "data_dict", "count")
+        reason = f"selects labelled examples, and {photos[0]} is given too: leave one out"
+    for name in names:
         if getattr(options, name) is not None:
-            reason = f"selects labelled examples, and {photos[0]} is given too: leave one out" if photos else _OF_PHOTOS
             raise UserError(f"--{name.replace('_', '-')} {reason}")

@@ -137,15 +137,16 @@ def check_used(
         choose: returns what is chosen by --data from a configuration.
         data: of --data; without it, the data are the configuration's.
     """
-    chosen = None if data is None else choose(config)
-    for text in overrides if data is not None else ():
-        path = text.partition("=")[0].removeprefix("--").replace("-", "_").split(".")
-        if not text.startswith("--data.") or (without := _with_part(config, before, path)) == config:
+    if data is None:
+        return
+    chosen = choose(config)
+    for text in overrides:
+        if not text.startswith("--data."):
             continue
-        if choose(without) == chosen:
-            raise UserError(
-                f"{text.partition('=')[0]} changes the configuration's data, not --data {data}: leave one of them out"
-            )
+        option = text.partition("=")[0]
+        without = _with_part(config, before, option.removeprefix("--").replace("-", "_").split("."))
+        if without != config and choose(without) == chosen:
+            raise UserError(f"{option} changes the configuration's data, not --data {data}: leave one of them out")
 
 
 def _with_part(config: Any, other: Any, path: Sequence[str]) -> Any:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -31,7 +31,7 @@ from tflane_jax.training.checkpoint import Checkpoints
 from tflane_jax.training.fine_tuning import origins, starting_params
 from tflane_jax.training.interrupt import StopRequest
 from tflane_jax.training.manifest import Manifest
-from tflane_jax.training.notices import due_notices, missing_scores, not_finite, only_told, print_notices
+from tflane_jax.training.notices import missing_scores, not_finite, only_told, print_notices, term_notices
 from tflane_jax.training.records import Record, RecordWriter, Unwritten, Window, by_name, read_records, seed_record
 from tflane_jax.training.restarts import adapt
 from tflane_jax.training.resumption import Carried, carried, latest
@@ -168,8 +168,8 @@ def train(
     progress = progress and is_first()
     mesh = training_mesh(config.batch_size, config.accumulate)
     optim = scaled_to_batch(optim, config.batch_size)
-    adaptive = None if optim.restarts is None or optim.restarts.adaptive is None else optim.restarts
-    if adaptive is not None and evaluate is None:
+    adaptive_restarts = None if optim.restarts is None or optim.restarts.adaptive is None else optim.restarts
+    if adaptive_restarts is not None and evaluate is None:
         raise UserError("optim.restarts.adaptive needs evaluations: pass `evaluate`, or set it to None")
     optimizer = make_optimizer(optim, config.steps)
     with contextlib.ExitStack() as stack, showing(progress), StopRequest() as stop:
@@ -195,7 +195,7 @@ def train(
             # Augmentation may change the size of images, and the model takes what it returns.
             example = example if prepare is None else prepare(example, (config.seeds[0], 0, 0))
             states = init_states(task, optimizer, config.seeds, example)
-        carry = Carried([] if adaptive is None else [Memory() for _ in config.seeds])
+        carry = Carried([] if adaptive_restarts is None else [Memory() for _ in config.seeds])
         started_from: dict[str, Any] = {"own_modules": own_code}
         data = {"examples": example_count(arrays), "content": content}
         agree_on_data(data)
@@ -250,17 +250,6 @@ def train(
             kept = of_all_seeds([of_one_process(state) for state in states])
             from_first(lambda: str(checkpoints.save(kept, manifest)))
 
-        def following() -> Any:
-            """Return the batches of the next step, None after the last one or where their examples cannot be read."""
-            nonlocal unread
-            try:
-                return next(feed, None)
-            except Exception as error:
-                if processes.process_count() > 1:  # the other processes would wait for this one
-                    raise
-                unread = error  # to be raised when this step is recorded and saved
-                return None
-
         unread: Exception | None = None
         saved_step, stopped = first, stop_signal(stop.signal, 0)
         due, carry.due = carry.due, False
@@ -283,11 +272,11 @@ def train(
                 evaluations = from_first(lambda: measured)
                 writer.write(seed_record(step, "val", scores := by_name(evaluations)))
                 if not carry.metrics and is_first():
-                    print_notices(missing_scores(step, scores, config.best_metric, adaptive))
+                    print_notices(missing_scores(step, scores, config.best_metric, adaptive_restarts))
                 carry.metrics = {name: float(np.mean(values)) for name, values in scores.items()}
-                if adaptive is not None:
+                if adaptive_restarts is not None:
                     together = of_all_seeds([state.opt_state for state in states])
-                    adapted = adapt(adaptive, together, carry.memories, evaluations, config.steps)
+                    adapted = adapt(adaptive_restarts, together, carry.memories, evaluations, config.steps)
                     together, carry.memories, cycles = adapted
                     changed = per_seed(together, config.seeds)
                     states = [replace(s, opt_state=place(o)) for s, o in zip(states, changed, strict=True)]
@@ -311,7 +300,7 @@ def train(
                 step += 1
                 carry.window.add({name: value for name, value in values.items() if name != "finite"})
                 asked = time.perf_counter()
-                batch = following()
+                batch, unread = _next_batches(feed)  # an error is raised when this step is recorded and saved
                 ended = time.perf_counter()
                 carry.times.add(ended - began, waited=ended - asked)
                 bar.update()
@@ -322,7 +311,7 @@ def train(
                     writer.write(record | carry.times.record())
                     print_notices(carry.times.notices(step, arrays))  # every process waits for examples of its own
                     if is_first():
-                        print_notices(due_notices(untold, record))
+                        print_notices(term_notices(untold, record))
                     bar.set_postfix_str(f"loss={np.mean(record['loss']):.4g}{carry.times.shown()}", refresh=False)
                     carry.window = Window()
                 if evaluate is not None and (step % config.eval_every == 0 or is_last):
@@ -344,3 +333,16 @@ def train(
         rate = (step - first) / carry.times.own if carry.times.own else 0.0
         unfinished = stopped if step < config.steps else None
         return TrainingResult(step, carry.metrics, compile_seconds, rate, asked_by=stopped, stopped_by=unfinished)
+
+
+def _next_batches(feed: Iterator[Any]) -> tuple[Any, Exception | None]:
+    """Return the batches of the next step, None after the last one; or None and the error of reading them.
+
+    Several processes raise the error at once: the others would wait for this one.
+    """
+    try:
+        return next(feed, None), None
+    except Exception as error:
+        if processes.process_count() > 1:
+            raise
+        return None, error

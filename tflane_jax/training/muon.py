@@ -73,23 +73,23 @@ def orthogonal(updates: Vectors) -> Vectors:
     """
     by_shape: dict[tuple[int, int], list[tuple[str, Stack]]] = {}
     for group, vector in updates.groups.items():
-        for stack in () if isinstance(vector, optax.MaskedNode) else updates.layout.stacks(group):
+        if isinstance(vector, optax.MaskedNode):
+            continue
+        for stack in updates.layout.stacks(group):
             by_shape.setdefault((min(stack.shape), max(stack.shape)), []).append((group, stack))
-    parts: dict[str, dict[int, jax.Array]] = {}
+    parts: dict[str, dict[int, jax.Array]] = {}  # of each group's vector, by their first row
     for shape, stacks in by_shape.items():
-        wide = [_matrices(updates.groups[group], stack) for group, stack in stacks]
-        wide = jnp.concatenate(
-            [x if stack.shape == shape else x.mT for x, (_, stack) in zip(wide, stacks, strict=True)]
-        )
-        found = _newton_schulz(wide) * (_RMS * np.sqrt(shape[1]))
+        kernels = [_matrices(updates.groups[group], stack) for group, stack in stacks]
+        wide = [x if stack.shape == shape else x.mT for x, (_, stack) in zip(kernels, stacks, strict=True)]
+        left = _newton_schulz(jnp.concatenate(wide)) * (_RMS * np.sqrt(shape[1]))
         for group, stack in stacks:
-            mine, found = found[: stack.count], found[stack.count :]
+            mine, left = left[: stack.count], left[stack.count :]
             rows = (mine if stack.shape == shape else mine.mT).reshape(stack.count, -1)
             rows = jnp.pad(rows, ((0, 0), (0, stack.rows * ROW - rows.shape[1])))
             parts.setdefault(group, {})[stack.row] = rows.reshape(-1)
-    for group, mine in parts.items():
+    for group, by_row in parts.items():
         if tail := updates.layout.tail(group):
-            mine[len(updates.groups[group]) // ROW - tail] = jnp.zeros(tail * ROW)
+            by_row[len(updates.groups[group]) // ROW - tail] = jnp.zeros(tail * ROW)
     return updates.map(
         lambda group, masked: (
             jnp.concatenate([parts[group][row] for row in sorted(parts[group])]) if group in parts else masked

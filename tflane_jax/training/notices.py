@@ -85,7 +85,7 @@ def _not_finite_in(batch: Any) -> str:
     return ", ".join(found)
 
 
-def due_notices(untold: dict[str, str], record: Record) -> list[str]:
+def term_notices(untold: dict[str, str], record: Record) -> list[str]:
     """Return the notices whose terms are above 0 in a record, and take them from `untold`."""
     due = [name for name in untold if np.max(record.get(name, 0.0)) > 0]
     return [f"step {record['step']}: {name} is {np.max(record[name]):.3g}. {untold.pop(name)}" for name in due]

@@ -226,12 +226,11 @@ def make_optimizer(
     decay = _decay_trained_leaves(config.weight_decay)
     if config.decayed == "kernels":
         decay = optax.masked(decay, is_decayed)
-    adam = _preconditioner(config, gather)
-    return optax.chain(
-        _clip_by_norm(config.clip_norm),
-        optax.chain(*((adam, decay) if config.decay == "decoupled" else (decay, adam)), _scale_by_rate(config, steps)),
-        *((scale_by_factors(config.lr_factors),) if config.lr_factors else ()),
-    )
+    preconditioner = _preconditioner(config, gather)
+    ordered = (preconditioner, decay) if config.decay == "decoupled" else (decay, preconditioner)
+    factors = (scale_by_factors(config.lr_factors),) if config.lr_factors else ()
+    # A chain in a chain, because checkpoints name the parts of the state by their places.
+    return optax.chain(_clip_by_norm(config.clip_norm), optax.chain(*ordered, _scale_by_rate(config, steps)), *factors)
 
 
 def _clip_by_norm(largest: float) -> optax.GradientTransformation:

@@ -201,9 +201,8 @@ def norm(vectors: Vectors) -> Float[Array, ""]:
 
 def any_in_leaf(vector: Bool[Array, " n"], layout: Layout, group: str) -> Bool[Array, " n"]:
     """Return for each number of a group's vector whether any number of its leaf is True."""
-    leaf_of_row = np.repeat(
-        np.arange(len(members := layout.members(group))), [layout.places[i].rows for i in members]
-    ).astype(np.int32)
+    members = layout.members(group)
+    leaf_of_row = np.repeat(np.arange(len(members)), [layout.places[i].rows for i in members]).astype(np.int32)
     leaf_of_row = np.pad(leaf_of_row, (0, layout.tail(group)), "edge")
     rows = vector.reshape(-1, ROW).any(1)
     leaves = jax.ops.segment_max(

@@ -160,8 +160,8 @@ def _row(name: str, found: dict[str, Any]) -> list[str]:
     return [name, *(f"{value:.1f}" for value in shown)]
 
 
-def main() -> None:
-    """Parse the command line and run."""
+def main() -> int:
+    """Parse the command line and run; return the exit code."""
     parser = command_line(__doc__)
     parser.add_argument("--names", nargs="+", default=CONFIGS, help="configurations")
     parser.add_argument("--child", help=argparse.SUPPRESS)
@@ -170,6 +170,7 @@ def main() -> None:
         print(_MEASURED + json.dumps(train(options.child, options.out)))
     else:
         run(options.out, options.names)
+    return 0
 
 
 if __name__ == "__main__":

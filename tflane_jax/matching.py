@@ -15,7 +15,7 @@ hang.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Literal, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
@@ -114,6 +114,26 @@ def _assign_on_host(cost: np.ndarray, valid: np.ndarray) -> np.ndarray:
     return query.reshape(*lead, -1)
 
 
+class _Search(NamedTuple):
+    """Shortest paths from one target to the C columns, as far as they are known.
+
+    Attributes:
+        distance: (C,) length of the shortest path found to each column.
+        via: (C,) target from which that path reaches the column; -1 for none.
+        done: (C,) columns whose distance is final.
+        row: target that the search goes on from, the holder of the last final column; -1: that column is free.
+        length: distance of the last final column.
+        column: the last final column.
+    """
+
+    distance: Float[Array, " c"]
+    via: Int[Array, " c"]
+    done: Bool[Array, " c"]
+    row: Int[Array, ""]
+    length: Float[Array, ""]
+    column: Int[Array, ""]
+
+
 def _augmenting_paths(cost: Float[Array, "q n"], valid: Bool[Array, " n"]) -> Int[Array, " n"]:
     """Solve one problem by successive shortest augmenting paths (Jonker-Volgenant); -1 for targets without a query.
 
@@ -130,37 +150,43 @@ def _augmenting_paths(cost: Float[Array, "q n"], valid: Bool[Array, " n"]) -> In
     def add_target(i, state):
         owner, u, v = state  # owner (columns,): target that holds the column, -1 if free
 
-        def grow(path):
-            distance, via, done, row, offset, _ = path
-            slack = table[row] - u[row] - v + offset
-            closer = ~done & (slack < distance)
-            distance, via = jnp.where(closer, slack, distance), jnp.where(closer, row, via)
-            column = lax.argmin(jnp.where(done, jnp.inf, distance), 0, jnp.int32)
-            done = done.at[column].set(True)
-            return distance, via, done, owner[column], distance[column], column
-
-        def searching(path):
-            return path[3] >= 0
+        def grow(search: _Search) -> _Search:
+            slack = table[search.row] - u[search.row] - v + search.length
+            closer = ~search.done & (slack < search.distance)
+            distance = jnp.where(closer, slack, search.distance)
+            via = jnp.where(closer, search.row, search.via)
+            column = lax.argmin(jnp.where(search.done, jnp.inf, distance), 0, jnp.int32)
+            return _Search(distance, via, search.done.at[column].set(True), owner[column], distance[column], column)
 
         start = order[i]
-        distance = jnp.full(columns, jnp.inf, jnp.float32)
-        nowhere = jnp.full(columns, -1, jnp.int32)
-        path = (distance, nowhere, jnp.zeros(columns, bool), start, jnp.float32(0.0), jnp.int32(0))
-        distance, via, done, _, shortest, end = lax.while_loop(searching, grow, path)
+        search = _Search(
+            distance=jnp.full(columns, jnp.inf, jnp.float32),
+            via=jnp.full(columns, -1, jnp.int32),
+            done=jnp.zeros(columns, bool),
+            row=start,
+            length=jnp.float32(0.0),
+            column=jnp.int32(0),
+        )
+        search = lax.while_loop(lambda search: search.row >= 0, grow, search)
 
         # Potentials inside the tree change by the rest of the shortest path.
-        gain = jnp.where(done, shortest - distance, 0.0)
-        holders = jnp.where(done & (owner >= 0), owner, targets)  # index `targets` is dropped
-        u = u.at[holders].add(gain, mode="drop").at[start].add(shortest)
+        gain = jnp.where(search.done, search.length - search.distance, 0.0)
+        holders = jnp.where(search.done & (owner >= 0), owner, targets)  # index `targets` is dropped
+        u = u.at[holders].add(gain, mode="drop").at[start].add(search.length)
         v = v - gain
 
         def flip(step):
+            """Give a column to the target that reached it; go on with the column that this target held before."""
             owner, column, _ = step
-            row = via[column]
-            previous = lax.argmax(owner == row, 0, jnp.int32)  # the column this row held before
+            row = search.via[column]
+            previous = lax.argmax(owner == row, 0, jnp.int32)
             return owner.at[column].set(row), previous, row
 
-        owner, _, _ = lax.while_loop(lambda s: s[2] != start, flip, flip((owner, end, start)))
+        def is_away_from_start(step):
+            _, _, row = step
+            return row != start
+
+        owner, _, _ = lax.while_loop(is_away_from_start, flip, flip((owner, search.column, start)))
         return owner, u, v
 
     state = (jnp.full(columns, -1, jnp.int32), jnp.zeros(targets, jnp.float32), jnp.zeros(columns, jnp.float32))

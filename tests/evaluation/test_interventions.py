@@ -12,8 +12,8 @@ from tests.fakes import FakeConfig, FakeDataset, fake_example
 from tflane_jax.datasets.streaming import Streamed
 from tflane_jax.errors import UserError
 from tflane_jax.evaluation.interventions import (
+    example_scenes,
     other_scene_rows,
-    scene_numbers,
     traffic_interventions,
     with_traffic,
 )
@@ -63,10 +63,10 @@ def test_own_traffic_changes_nothing():
 
 
 def test_scenes_are_numbered_by_their_first_frames():
-    np.testing.assert_array_equal(scene_numbers(EXAMPLES), [0, 0, 1, 1, 2, 2, 3])
-    np.testing.assert_array_equal(scene_numbers(Streamed(FakeDataset(FakeConfig(5)))), [0, 0, 1, 1, 2])
+    np.testing.assert_array_equal(example_scenes(EXAMPLES), [0, 0, 1, 1, 2, 2, 3])
+    np.testing.assert_array_equal(example_scenes(Streamed(FakeDataset(FakeConfig(5)))), [0, 0, 1, 1, 2])
     second = jax.tree.map(lambda leaf: leaf[1:4], EXAMPLES)  # starts in the middle of a scene
-    np.testing.assert_array_equal(scene_numbers(second), [0, 1, 1])
+    np.testing.assert_array_equal(example_scenes(second), [0, 1, 1])
 
 
 def test_examples_that_cannot_be_changed_are_named():

@@ -17,7 +17,7 @@ from tflane_jax.datasets.base import spread
 from tflane_jax.datasets.front_views import FrontViewConfig, FrontViewDataset
 from tflane_jax.datasets.overlap import Nearness
 from tflane_jax.errors import UserError
-from tflane_jax.evaluation.edge_types import weights_edge_types
+from tflane_jax.evaluation.edge_types import has_edge_weights
 from tflane_jax.evaluation.interventions import with_traffic
 from tflane_jax.evaluation.lane_errors import lane_errors
 from tflane_jax.evaluation.predict import undivided_notices
@@ -119,7 +119,7 @@ def _save_errors(run: Run, task: Any, source: Any, stem: Path, meta: dict[str, A
 def _save_edge_types(run: Run, source: Any, stem: Path) -> list[Path]:
     """Write which edge types the graph encoder of each seed uses, for models that have one."""
     task = run.config.task
-    if not isinstance(task, LaneShapeTask) or not weights_edge_types(task.model):
+    if not isinstance(task, LaneShapeTask) or not has_edge_weights(task.model):
         return []
     dataset, seeds = sources.open_dataset(source), run.config.training.seeds
     examples = stack_examples([dataset.example(index) for index in spread(len(dataset), _IMAGES)])

@@ -40,8 +40,8 @@ def run(options: argparse.Namespace) -> int:
     groups = None if grouping is None else _scored(files, lambda: score(predictions, truth, grouping, scene_of)).total()
     scored = _scored(files, lambda: score(predictions, truth, protocol.metrics, scene_of))
     remarks = protocol.remarks(predictions, truth)
-    if protocol.found and not remarks:  # which may be the reason
-        remarks += about.nothing_near(predictions, truth, scored.total().get(protocol.found), protocol.frame)
+    if protocol.zero_score and not remarks:  # which may be the reason
+        remarks += about.nothing_near(predictions, truth, scored.total().get(protocol.zero_score), protocol.look_at)
     if options.bootstrap and protocol.no_scenes and drives is None:
         remarks.append(f"{protocol.no_scenes}: the intervals are too narrow (name the drives by --scenes FILE)")
     for remark in remarks:

@@ -140,7 +140,7 @@ def _contents(file: IO[bytes]) -> _Contents:
 
 
 def _other_format(start: bytes) -> str | None:
-    """Return of which well-known format for weights, that is not read, a file's first bytes are."""
+    """Return the name of the well-known format that a file's first bytes show, of those that are not read here."""
     if start[8:9] == b"{" and int.from_bytes(start[:8], "little") < 1 << 32:
         return "safetensors"
     if start.startswith(b"\x89HDF"):

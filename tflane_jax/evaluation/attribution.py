@@ -102,19 +102,29 @@ def lanes_by_gain(
         group: one of `LANE_GROUPS`.
         batch_size: examples predicted at a time.
     """
-    own = list(_frames(task, params, examples, batch_size))
-    none = _frames(task, params, with_traffic(examples, "none"), batch_size)
-    others = repeat(None, len(own)) if baseline is None else _frames(*baseline, examples, batch_size)
+    with_flow = _frames(task, params, examples, batch_size)
+    without_flow = _frames(task, params, with_traffic(examples, "none"), batch_size)
+    count = len(examples.has_previous)
+    of_baseline = repeat(None, count) if baseline is None else _frames(*baseline, examples, batch_size)
     gains = []
-    for i, (found, without, other) in enumerate(zip(own, none, others, strict=True)):
+    for i, (own, less, other) in enumerate(zip(with_flow, without_flow, of_baseline, strict=True)):
         example: Example = row_of(examples, i)
         truth, lanes = _truth(task, example), valid_lanes(task, example)
-        score, query = lane_scores(found, lanes)
-        less = lane_scores(without, lanes)[0]
-        trained_without = np.full(len(lanes), np.nan) if other is None else lane_scores(other, lanes)[0]
+        score, query = lane_scores(own, lanes)
+        without = lane_scores(less, lanes)[0]
+        by_baseline = np.full(len(lanes), np.nan) if other is None else lane_scores(other, lanes)[0]
         members = lane_groups(truth, np.asarray(example.bev), _flow(example), ground)[group]
-        columns = np.arange(len(lanes)), query, score, less, trained_without
-        gains += [LaneGain(i, *row) for row in zip(*(column[members].tolist() for column in columns), strict=True)]
+        gains += [
+            LaneGain(
+                example=i,
+                lane=lane,
+                query=int(query[lane]),
+                score=float(score[lane]),
+                without=float(without[lane]),
+                baseline=float(by_baseline[lane]),
+            )
+            for lane in np.flatnonzero(members).tolist()
+        ]
     return sorted(gains, key=lambda lane: -lane.gain)
 
 

@@ -30,7 +30,10 @@ def scene_weights(scenes: int, samples: int, *, seed: int = 0) -> Int[np.ndarray
 
 
 def scene_numbers(continues: Sequence[bool]) -> Int[np.ndarray, " f"]:
-    """Return the number of each frame's scene, of frames that belong to the scene of the frame before or begin one."""
+    """Return the number of each frame's scene, from 0; `continues[i]`: frame i is of the scene of frame i - 1.
+
+    The first frame begins a scene, whatever is said of it.
+    """
     return np.cumsum(~np.array([True, *continues[1:]])) if continues else np.zeros(0, int)
 
 

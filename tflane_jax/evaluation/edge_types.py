@@ -49,7 +49,7 @@ class EdgeTypes:
                     yield place | shown
 
 
-def weights_edge_types(model: LstrConfig) -> bool:
+def has_edge_weights(model: LstrConfig) -> bool:
     """Return whether a model's encoder weights its edge types: GTN and HAN do, transformer and GCN do not."""
     return isinstance(model.encoder, (GtnEncoderConfig, HanEncoderConfig))
 

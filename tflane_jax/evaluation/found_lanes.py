@@ -149,9 +149,10 @@ def frames_of_difference(
     lead = np.asarray(only_second) - np.asarray(only_first)
     first, second = _leaders(-lead, scene), _leaders(lead, scene)
     alone = int(np.sum(only_first)), int(np.sum(only_second))
-    places = round(count * alone[1] / max(sum(alone), 1))
-    places = min(max(places, 1, count - len(first)), len(second), count - min(len(first), 1))
-    return first[: count - places], second[:places]
+    # A model that leads anywhere gets a frame, and frames that one cannot fill go to the other.
+    least, most = max(1, count - len(first)), min(len(second), count - min(len(first), 1))
+    of_second = min(max(round(count * alone[1] / max(sum(alone), 1)), least), most)
+    return first[: count - of_second], second[:of_second]
 
 
 def _leaders(lead: Int[np.ndarray, " f"], scene: Int[np.ndarray, " f"]) -> list[int]:

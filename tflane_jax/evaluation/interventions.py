@@ -12,6 +12,7 @@ from jaxtyping import Int
 from tflane_jax.datasets.base import FrameInfo, IndexedExamples
 from tflane_jax.datasets.streaming import Streamed
 from tflane_jax.errors import UserError
+from tflane_jax.evaluation.by_scene import scene_numbers
 from tflane_jax.evaluation.results import EvaluationConfig, Traffic
 from tflane_jax.scene import Example, TrafficFlow
 
@@ -40,7 +41,7 @@ def with_traffic(arrays: Example | Streamed, traffic: Traffic) -> Example | Stre
         return arrays
     if isinstance(arrays, Streamed):
         return replace(arrays, dataset=dataset_with_traffic(arrays.dataset, traffic))
-    rows = other_scene_rows(scene_numbers(arrays)) if traffic == "other-scene" else None
+    rows = other_scene_rows(example_scenes(arrays)) if traffic == "other-scene" else None
     flow = _flow(arrays)
     return replace(arrays, traffic_flow=_none(flow) if rows is None else jax.tree.map(lambda leaf: leaf[rows], flow))
 
@@ -60,23 +61,21 @@ def traffic_interventions(arrays: Example | Streamed, config: EvaluationConfig) 
     if config.traffic != "own":
         return {}
     found = {NO_TRAFFIC: replace(config, traffic="none")}
-    if len(np.unique(scene_numbers(arrays))) > 1:
+    if len(np.unique(example_scenes(arrays))) > 1:
         found[OTHER_TRAFFIC] = replace(config, traffic="other-scene")
     return found
 
 
-def scene_numbers(arrays: Example | Streamed) -> Int[np.ndarray, " n"]:
+def example_scenes(arrays: Example | Streamed) -> Int[np.ndarray, " n"]:
     """Return the number of each example's scene, 0 for the first."""
     if isinstance(arrays, Streamed):
         return _scenes_of(arrays.dataset)
-    starts = ~np.asarray(arrays.has_previous)
-    starts[:1] = False
-    return np.cumsum(starts)
+    return scene_numbers(np.asarray(arrays.has_previous).tolist())
 
 
 def _scenes_of(dataset: IndexedExamples) -> Int[np.ndarray, " n"]:
     names = [dataset.info(index).scene for index in range(len(dataset))]
-    return np.cumsum(np.array([index > 0 and name != names[index - 1] for index, name in enumerate(names)], int))
+    return scene_numbers([name == before for before, name in zip([None, *names], names, strict=False)])
 
 
 def other_scene_rows(scene: Int[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:

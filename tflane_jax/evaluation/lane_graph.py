@@ -61,7 +61,8 @@ class LaneGraphMetrics:
         versions: versions of the OpenLane-V2 centerline metrics.
         frame_groups, lane_groups: names of the groups of frames and of further groups of lanes, see
             `metrics.groups.GroupedMetrics`.
-        parts: predicted parts that are measured as long as no frame was seen.
+        parts: predicted parts of which `compute` gives numbers before the first frame; each frame replaces them by its
+            own.
         map_measures, line_labels, line_dims: of the lines of vector maps, see `MapLineMetrics`.
         topology: confidences of edges, see `geometric_topology.edge_confidences`.
     """
@@ -159,7 +160,8 @@ class LaneGraphMetrics:
             recalled |= self._lines.recalled()
         scene, ratios = scene_numbers(self._continues), {}
         for group, counts in recalled.items():
-            ratios[f"{group}/recall"] = counted_ratio(counts[:, ::-1] * [1, _THRESHOLDS], scene)
+            lanes, hits = counts.T
+            ratios[f"{group}/recall"] = counted_ratio(np.stack([hits, _THRESHOLDS * lanes], -1), scene)
             for name, parts in means.get(group, {}).items():
                 ratios[f"{group}/{name}"] = summed_ratio(parts, scene)
         return ratios
@@ -229,37 +231,39 @@ def evaluate_lanes(
         arrays: examples with ground truth, see `datasets.batches`.
         config: batch size, versions, and traffic flow that the model sees.
         ground: the range that the BEV evidence covers; None for a model that does not see it, without those groups.
-        frame_groups: a further group for each example.
+        frame_groups: the name of a further group for each example, in their order; () for none.
 
     Raises:
         ValueError: the task predicts no lanes.
         UserError: the examples do not allow the configured traffic flow, see `with_traffic`.
     """
     config = config or EvaluationConfig()
-    sightings, metrics = Sightings(), LaneGraphMetrics(config.versions)
+    sightings = Sightings()
+    metrics: LaneGraphMetrics | None = None
     changed = with_traffic(arrays, config.traffic)
     predicted = predicted_batches(task, params, changed, config.batch_size, _without_images, what=FOR_SCORES)
     originals = None if changed is arrays else ordered_batches(arrays, config.batch_size)
-    for number, (indices, batch, answer) in enumerate(predicted):
+    for indices, batch, answer in predicted:
         if originals is not None:
             _, batch = next(originals)
-        if number == 0:
+        if metrics is None:  # the first batch tells what is predicted and labelled
+            of_markers = () if batch.markers is None else sightings.groups
             metrics = LaneGraphMetrics(
                 config.versions,
-                (*(() if batch.markers is None else sightings.groups), *dict.fromkeys(frame_groups)),
+                frame_groups=(*of_markers, *dict.fromkeys(frame_groups)),
                 lane_groups=LANE_GROUPS if _members(batch, answer, 0, ground) else (),
                 map_measures=config.map_measures,
                 line_labels=line_labels(batch.map_lines),
                 line_dims=_line_dims(batch, answer),
                 topology=config.topology,
             )
-        for row in range(len(indices)):
+        for row, index in enumerate(indices):
             prediction, example = jax.tree.map(lambda leaf, i=row: leaf[i], (answer, _labels(batch)))
-            groups = [frame_groups[int(indices[row])]] if frame_groups else []
+            groups = [frame_groups[index]] if frame_groups else []
             if batch.markers is not None:
                 groups.append(sightings.next(batch.markers.valid[row].any(), batch.has_previous[row]))
             metrics.update(prediction, example, groups, _members(batch, answer, row, ground))
-    return metrics
+    return LaneGraphMetrics(config.versions) if metrics is None else metrics
 
 
 def _members(batch: Example, answer: Prediction, row: int, ground: PerceptionRange | None) -> dict[str, Members]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -75,38 +76,60 @@ def judge_lanes(
         lanes: (u, v), fractions of the view.
         scores: of each lane, 0 to 1.
     """
-    paint, supported, clutter, lines, weights = [], [], [], [], []
-    for lane, score in zip(lanes, scores, strict=True):
-        u, v = lane[_judged(lane)].T
-        if len(u) < _LEAST_POINTS:
-            paint.append(0.0)
-            supported.append(False)
-            continue
-        on, beside, parts = _paint(grey, view, u, v)
-        paint.append(on)
-        supported.append(on >= _SUPPORTED and on - beside >= _MORE and parts >= _SPREAD)
-        clutter.append(beside)
-        lines.append(np.polyfit(v, u, 1, w=v - HORIZON))
-        weights.append(float(score) * max(on - beside, 0.0))
-    if len(lines) < 2:
-        return Judgement(0.0, None, 0.0, tuple(paint), tuple(supported), crossed=False)
-    slope, start = np.array(lines).T
+    every = [_judge_lane(grey, view, lane, score) for lane, score in zip(lanes, scores, strict=True)]
+    paint = tuple(0.0 if lane is None else lane.paint for lane in every)
+    supported = tuple(lane is not None and lane.supported for lane in every)
+    judged = [lane for lane in every if lane is not None]
+    if len(judged) < 2:
+        return Judgement(0.0, None, 0.0, paint, supported, crossed=False)
+    slope, start = np.array([lane.slope for lane in judged]), np.array([lane.start for lane in judged])
     # The point (u, v) nearest to all lines u = start + slope v.
     system = np.stack([np.ones(len(slope)), -slope], 1)
     meeting = np.linalg.lstsq(system, start, rcond=None)[0]
     apart = float(np.abs(system @ meeting - start).max())
     near, far = start + slope, start + slope * (HORIZON + 0.08)
-    # Where straight lines through them do, or they themselves within their extents.
-    crossed = bool(
-        (np.diff(far[np.argsort(near)]) < -_CROSSED).any() or not without_crossings(lanes, scores.tolist(), 1.0).all()
-    )
+    # Either the straight lines through the lanes change places towards the horizon, or the lanes themselves cross.
+    straight_cross = bool((np.diff(far[np.argsort(near)]) < -_CROSSED).any())
+    crossed = straight_cross or not without_crossings(lanes, scores.tolist(), 1.0).all()
     together = float(np.exp(-0.5 * (apart / _MEETING_SPREAD) ** 2))
-    clean = max(1.0 - float(np.mean(clutter)) / _MOST_CLUTTER, 0.0)
+    clean = max(1.0 - float(np.mean([lane.clutter for lane in judged])) / _MOST_CLUTTER, 0.0)
     aligned = float(np.exp(-0.5 * ((meeting[1] - HORIZON) / _HORIZON_SPREAD) ** 2))
-    trust = together * clean * (sum(weights) + _LANE_WORTH * (len(lines) - 1))
+    trust = together * clean * (sum(lane.weight for lane in judged) + _LANE_WORTH * (len(judged) - 1))
     value = 0.0 if crossed else trust * aligned
     column, row = map(float, view.to_photo(meeting))
-    return Judgement(value, (column, row), trust, tuple(paint), tuple(supported), crossed)
+    return Judgement(value, (column, row), trust, paint, supported, crossed)
+
+
+class _JudgedLane(NamedTuple):
+    """A lane of a view that is long enough to be judged.
+
+    Attributes:
+        paint: fraction of it that lies on paint.
+        clutter: the same of lines beside it.
+        supported: it lies on paint rather than by chance.
+        slope, start: of the straight line u = start + slope v through it.
+        weight: in the trust of the view.
+    """
+
+    paint: float
+    clutter: float
+    supported: bool
+    slope: float
+    start: float
+    weight: float
+
+
+def _judge_lane(
+    grey: UInt8[np.ndarray, "h w"], view: Placement, lane: Float[np.ndarray, "p 2"], score: float
+) -> _JudgedLane | None:
+    """Return what is found about one lane; None if fewer than `_LEAST_POINTS` of its points can be judged."""
+    u, v = lane[_judged(lane)].T
+    if len(u) < _LEAST_POINTS:
+        return None
+    paint, clutter, parts = _paint(grey, view, u, v)
+    supported = paint >= _SUPPORTED and paint - clutter >= _MORE and parts >= _SPREAD
+    slope, start = np.polyfit(v, u, 1, w=v - HORIZON)
+    return _JudgedLane(paint, clutter, supported, slope, start, float(score) * max(paint - clutter, 0.0))
 
 
 def agreement(

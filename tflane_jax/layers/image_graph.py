@@ -74,7 +74,7 @@ def _mix(relations: tuple[Relation, ...], type_weights, x, valid) -> Array:
 
 def _mix_backward(relations, residuals, gradient):
     type_weights, x, valid = residuals
-    gradient, back = bordered_sides(relations, gradient, valid, -1)
+    gradient, back = bordered_sides(relations, gradient, valid, sign=-1)
     by_line = {axis: gradient.sum(axis, keepdims=True) for axis in AXES.values()}
     to_weights, own, to_x = [], jnp.zeros((1, 1, 1), x.dtype), jnp.zeros_like(x)
     messages = _messages(relations, x, valid)

@@ -62,10 +62,10 @@ def auxiliary_losses(
         elif name == "lane_proposals":
             each = jax.vmap(partial(lane_proposal_sums, range_=bev_range))
             count = jnp.maximum(lanes.valid.sum(), 1).astype(jnp.float32)
-            sums, by = each(output, lanes), (weights.proposal_weight, weights.points_weight)
-            heat, shapes = (weight * value.sum() / count for weight, value in zip(by, sums, strict=True))
-            report |= {"proposal_heat": heat, "proposal_points": shapes}
-            losses += [heat, shapes]
+            heat, shapes = each(output, lanes)
+            report["proposal_heat"] = weights.proposal_weight * heat.sum() / count
+            report["proposal_points"] = weights.points_weight * shapes.sum() / count
+            losses += [report["proposal_heat"], report["proposal_points"]]
         else:
             raise without_loss(name, "auxiliary_losses")
     return losses, report

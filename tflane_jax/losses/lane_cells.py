@@ -27,8 +27,8 @@ class LaneCells(NamedTuple):
     """Targets of the cells.
 
     Attributes:
-        inside: of some straight piece of a lane, the point nearest to the cell's center lies in the cell. A lane that
-            only cuts a corner may not count.
+        inside: a lane passes through the cell. Tested by the point of each of its straight pieces that is nearest to
+            the cell's center, so that a lane which only cuts a corner may not count.
         near: a lane passes within 1.5 cells of the cell's center.
         offset: from the center to the nearest point of a lane, in cells along x and y; 0 unless `near`.
         direction: unit direction of that lane; 0 unless `near`.
@@ -65,8 +65,10 @@ def lane_cells(
         return LaneCells(nothing, nothing, jnp.zeros((h, w, 2)), jnp.zeros((h, w, 2)))
     column, row = jnp.meshgrid(*(jnp.arange(size, dtype=jnp.float32) + 0.5 for size in (w, h)))
 
+    # Over the pieces so far: squared distance of the nearest, least max(|x|, |y|), step (x, y) to and index of the
+    # nearest.
     def compare(i: Int[Array, ""], best: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
-        squared, apart, x, y, nearest = best
+        squared, chebyshev, x, y, nearest = best
         along = ((column - begin[i, 0]) * step[i, 0] + (row - begin[i, 1]) * step[i, 1]) / squares[i]
         along = jnp.clip(along, 0.0, 1.0)
         here_x, here_y = begin[i, 0] + along * step[i, 0] - column, begin[i, 1] + along * step[i, 1] - row
@@ -74,7 +76,7 @@ def lane_cells(
         closer = here < squared
         return (
             jnp.where(closer, here, squared),
-            jnp.minimum(apart, jnp.where(valid[i], jnp.maximum(jnp.abs(here_x), jnp.abs(here_y)), jnp.inf)),
+            jnp.minimum(chebyshev, jnp.where(valid[i], jnp.maximum(jnp.abs(here_x), jnp.abs(here_y)), jnp.inf)),
             jnp.where(closer, here_x, x),
             jnp.where(closer, here_y, y),
             jnp.where(closer, i, nearest),
@@ -84,12 +86,12 @@ def lane_cells(
     far, zero = jnp.full((h, w), jnp.inf), jnp.zeros((h, w))
     start = (far, far, zero, zero, jnp.zeros((h, w), jnp.int32))
     pieces = len(begin) if used is None else used * (points.shape[1] - 1)
-    squared, apart, x, y, nearest = lax.fori_loop(0, pieces, compare, start)
+    squared, chebyshev, x, y, nearest = lax.fori_loop(0, pieces, compare, start)
     near = squared <= _RADIUS**2
     metres = step * jnp.asarray(range_.size(2), jnp.float32)[None] / count[None]
     direction = (metres / jnp.sqrt((metres**2).sum(-1, keepdims=True) + 1e-6))[nearest]
     offset, direction = (jnp.where(near[..., None], value, 0.0) for value in (jnp.stack([x, y], -1), direction))
-    return LaneCells(apart < 0.5, near, offset, direction)
+    return LaneCells(chebyshev < 0.5, near, offset, direction)
 
 
 def used_lanes(valid: Bool[Array, "b l"]) -> Int[Array, ""]:

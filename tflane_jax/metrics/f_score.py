@@ -37,7 +37,7 @@ class CenterlineFScore:
         """Add one frame; raise UserError for lines that cannot be measured."""
         check_kinds(detections, truth, (LaneDetections, LaneTruth))
         true, found = sample_lanes(truth.points, "truth"), sample_lanes(detections.points, "detections")
-        recalled, precise = found_lanes(true, found)
+        recalled, precise = count_found(true, found)
         self._counts += [recalled, precise, len(true.points), len(found.points)]
         self._frames += 1
 
@@ -111,7 +111,7 @@ def _interpolated(points: Float[np.ndarray, "l n 3"], slope_type: np.dtype | typ
     return slope[lane, start] * ahead[..., None] + points[lane, start, 1:]
 
 
-def found_lanes(true: SampledLanes, found: SampledLanes) -> tuple[int, int]:
+def count_found(true: SampledLanes, found: SampledLanes) -> tuple[int, int]:
     """Return the numbers of true lanes found and of detections that find one, in the pairing of least cost."""
     from scipy.optimize import linear_sum_assignment
 

@@ -124,12 +124,11 @@ class LaneSegmentMetrics:
         """Return the metrics, given those of segments, and which categories of areas count."""
         scores, categories, hits = pooled(self._area_detections, (0,), (len(AREA_THRESHOLDS), 0))
         truths = self._true_areas.sum(0)
-        areas = {
-            name: [average_precision_11(scores[own], row[own], int(truths[category])) for row in hits]
-            for name, category in _CATEGORIES.items()
-            if counted[category]
-            for own in [categories == category]
-        }
+        areas: dict[str, list[float]] = {}
+        for name, category in _CATEGORIES.items():
+            if counted[category]:
+                own, total = categories == category, int(truths[category])
+                areas[name] = [average_precision_11(scores[own], row[own], total) for row in hits]
         derived = {name: float(value) for name, value in self._derived(lanes, areas, counted).items()}
         at_threshold = {
             f"{name}@{threshold}": value
@@ -159,12 +158,12 @@ class LaneSegmentMetrics:
         scores, categories, hits = pooled(self._area_detections, (0,), (len(AREA_THRESHOLDS), 0))
         frame, truths = frame_numbers(self._area_detections), self._true_areas
         whole = truths.sum(0)
-        areas = {
-            name: list(bootstrap_precisions(scores[own], hits[:, own], frame[own], truths[:, category], weights)[0].T)
-            for name, category in _CATEGORIES.items()
-            if scope == "all" or whole[category]
-            for own in [categories == category]
-        }
+        areas = {}
+        for name, category in _CATEGORIES.items():
+            if scope == "all" or whole[category]:
+                own = categories == category
+                eleven, _ = bootstrap_precisions(scores[own], hits[:, own], frame[own], truths[:, category], weights)
+                areas[name] = list(eleven.T)
         derived = self._derived(lanes, areas, kept_in_sample(weights @ truths, whole).T)
         if self.flavour == "LaneSegNet":
             lanes = {"AP_l": lanes["AP_l"]}

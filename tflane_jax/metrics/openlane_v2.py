@@ -10,7 +10,7 @@ and the groups of lanes are this project's own (docs/metrics.md).
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -30,6 +30,20 @@ from tflane_jax.metrics.groups import Scope
 from tflane_jax.metrics.matching import average_precision_11, average_precision_area, pooled, ranked
 from tflane_jax.metrics.merging import by_frame, joined
 from tflane_jax.metrics.topology import Version, check_versions
+
+
+class _Truths(NamedTuple):
+    """Numbers of true lanes and elements in every frame.
+
+    Attributes:
+        lanes: (F,) true lanes.
+        vertices: (F,) of TOP_lt.
+        elements: (F, A) traffic elements by attribute.
+    """
+
+    lanes: Int[np.ndarray, " f"]
+    vertices: Int[np.ndarray, " f"]
+    elements: Int[np.ndarray, "f a"]
 
 
 class CenterlineMetrics:
@@ -116,12 +130,11 @@ class CenterlineMetrics:
         An attribute that the test set has and the sample lacks is left out of `DET_t`: 0, as officially where there are
         detections of it, would be the luck of the draw. Without any attribute, `DET_t` and `OLS` are missing.
         """
-        return self._numbers(kept_in_sample(self._truths.sum(0)[2:], whole._truths.sum(0)[2:]))
+        return self._numbers(kept_in_sample(self._truths.elements.sum(0), whole._truths.elements.sum(0)))
 
     def _numbers(self, counted: Bool[np.ndarray, " a"]) -> dict[str, float]:
         """Return the metrics, with those attributes of traffic elements that count."""
-        truths = self._truths.sum(0)
-        lanes = int(truths[0])
+        lanes, elements = int(self._truths.lanes.sum()), self._truths.elements.sum(0)
         result: dict[str, float] = {"frames": len(self._frame_truths), "lanes": lanes}
         scores, hits = ranked(*pooled(self._lane_detections, (len(LANE_THRESHOLDS), 0)))
         precisions = [average_precision_11(scores, row, lanes) for row in hits]
@@ -141,7 +154,7 @@ class CenterlineMetrics:
 
         scores, hits, attributes = pooled(self._element_detections, (0,), (0,))
         precision = {
-            i: average_precision_11(scores[attributes == i], hits[attributes == i], int(truths[2 + i]))
+            i: average_precision_11(scores[attributes == i], hits[attributes == i], int(elements[i]))
             for i in np.flatnonzero(counted).tolist()
         }
         result |= {"DET_t": float(np.mean(list(precision.values())))} if precision else {}
@@ -164,7 +177,7 @@ class CenterlineMetrics:
         truths = self._truths
         scores, hits = pooled(self._lane_detections, (len(LANE_THRESHOLDS), 0))
         frame = frame_numbers(self._lane_detections)
-        eleven, area = bootstrap_precisions(scores, hits, frame, truths[:, 0], weights)
+        eleven, area = bootstrap_precisions(scores, hits, frame, truths.lanes, weights)
         result = {"DET_l": eleven.mean(1), "AP_l": area.mean(1)}
         result |= {name: bootstrap_mean(parts, weights) for name, parts in self.means().items()}
         if not self._with_elements:
@@ -173,17 +186,17 @@ class CenterlineMetrics:
         frame, precisions = frame_numbers(self._element_detections), []
         for i in range(ATTRIBUTES):
             own = attributes == i
-            eleven, _ = bootstrap_precisions(scores[own], hits[None, own], frame[own], truths[:, 2 + i], weights)
+            eleven, _ = bootstrap_precisions(scores[own], hits[None, own], frame[own], truths.elements[:, i], weights)
             precisions.append(eleven[:, 0])
-        elements = truths[:, 2:]
-        counted = kept_in_sample(weights @ elements, elements.sum(0))
+        counted = kept_in_sample(weights @ truths.elements, truths.elements.sum(0))
         result["DET_t"] = (np.stack(precisions, -1) * counted).sum(-1) / np.maximum(counted.sum(-1), 1)
         return result | self._overall(result)
 
     @property
-    def _truths(self) -> Int[np.ndarray, "f 15"]:
-        """Of every frame: true lanes, vertices of TOP_lt, true elements by attribute."""
-        return by_frame(self._frame_truths, (2 + ATTRIBUTES,), int)
+    def _truths(self) -> _Truths:
+        """Numbers of true lanes, vertices and elements of every frame."""
+        counts = by_frame(self._frame_truths, (2 + ATTRIBUTES,), int)
+        return _Truths(counts[:, 0], counts[:, 1], counts[:, 2:])
 
     @property
     def _with_elements(self) -> bool:
@@ -204,9 +217,9 @@ class CenterlineMetrics:
         """
         sums = by_frame(self._frame_topology, (2, len(self.versions), len(LANE_THRESHOLDS)))
         truths = self._truths
-        vertices = {"TOP_ll": 2 * truths[:, 0]}
+        vertices = {"TOP_ll": 2 * truths.lanes}
         if self._element_detections:
-            vertices["TOP_lt"] = truths[:, 1]
+            vertices["TOP_lt"] = truths.vertices
         return {
             name + suffix: (sums[:, row, column], number)
             for row, (name, number) in enumerate(vertices.items())

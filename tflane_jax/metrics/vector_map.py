@@ -117,12 +117,10 @@ class VectorMapMetrics:
         thresholds, truths = self.thresholds, self._truths.sum(0)
         scores, classes, hits = ranked(*pooled(self._detections, (0,), (len(thresholds), 0)))
         hits, lines = hits.astype(bool), int(truths.sum())
-        measured = np.flatnonzero(counted)
-        precision = {
-            LINE_CLASSES[c]: [average_precision_area(scores[own], row[own], int(truths[c])) for row in hits]
-            for c in measured
-            for own in [classes == c]
-        }
+        precision: dict[str, list[float]] = {}
+        for c in np.flatnonzero(counted).tolist():
+            own, total = classes == c, int(truths[c])
+            precision[LINE_CLASSES[c]] = [average_precision_area(scores[own], row[own], total) for row in hits]
         mean, at_threshold = {}, {}
         if precision:
             table = np.array(list(precision.values()))

@@ -170,24 +170,24 @@ class BevEncoder(nn.Module):
             deterministic: no dropout.
             fuse: how priors change the queries of each layer, after spatial attention.
         """
-        config, initial = self.config, queries
+        config, first_queries = self.config, queries
         here = jnp.asarray(cell_points(config.grid))
         before = here + jnp.where(history.valid, shift, 0.0)[None]
-        cells = jnp.stack([before, here], 1)
+        places = jnp.stack([before, here], 1)
         past = history.features.reshape(queries.shape)
-        # Static arguments: the module itself counts as the first.
+        # Static are `shapes`, `deterministic` and `fuse`: the module itself is argument 0.
         layer = nn.remat(BevEncoderLayer, static_argnums=(8, 9, 10)) if config.remat else BevEncoderLayer
         for i in range(config.layers):
             # Without a memory, both frames are the queries themselves.
             previous = jnp.where(history.valid, past, queries)
             present = queries
             if config.temporal_value == "initial":
-                present = jnp.where(history.valid, initial, queries)
+                present = jnp.where(history.valid, first_queries, queries)
             queries = layer(config, name=f"layer_{i}")(
                 queries,
                 position,
                 (previous, present),
-                cells,
+                places,
                 tokens,
                 reference,
                 visible,
@@ -209,7 +209,7 @@ class BevEncoderLayer(nn.Module):
         queries: Float[Array, "q c"],
         position: Float[Array, "q c"],
         frames: tuple[Float[Array, "q c"], Float[Array, "q c"]],
-        cells: Float[Array, "q 2 2"],
+        places: Float[Array, "q 2 2"],
         tokens: Float[Array, "v hw c"],
         reference: Float[Array, "v q z 2"],
         visible: Bool[Array, "v q z"],
@@ -219,7 +219,8 @@ class BevEncoderLayer(nn.Module):
     ) -> Float[Array, "q c"]:
         """Return the queries after the layer.
 
-        `frames` are the previous and present values of temporal attention, `fuse` is `fuse_priors` of this layer.
+        `frames` are the previous and present values of temporal attention, and `places` (Q, 2, 2) the center (x, y) of
+        each cell in the previous and in the present frame, in [0, 1]. `fuse` is `fuse_priors` of this layer.
         """
         config, grid = self.config, self.config.grid
         init = nn.initializers.xavier_uniform()
@@ -234,7 +235,7 @@ class BevEncoderLayer(nn.Module):
             name="temporal_attention",
         )
         with computing(config.precision):
-            attended = temporal(queries + position, *frames, (grid.rows, grid.columns), cells)
+            attended = temporal(queries + position, *frames, (grid.rows, grid.columns), places)
         queries = add("temporal", queries, attended)
         if config.attention == "kernel":
             spatial = GeometryKernelAttention(

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from functools import partial
 
 import flax.linen as nn
+import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
@@ -137,8 +138,16 @@ class ElementDecoder(nn.Module):
             tokens = run_layer(self, layer, config, *given, shapes=shapes, deterministic=deterministic)
         return self._decode(tokens, shapes, valid, ratios, size, deterministic)
 
-    def _decode(self, memory, shapes, valid, ratios, size, deterministic: bool) -> ElementOutput:
-        """Run the decoder; boxes are (cx, cy, w, h), fractions of the image size."""
+    def _decode(
+        self,
+        cells: Float[Array, "t c"],
+        shapes: Sequence[tuple[int, int]],
+        valid: Bool[Array, " t"],
+        ratios: Float[Array, "levels 2"],
+        size: Int[Array, " 2"],
+        deterministic: bool,
+    ) -> ElementOutput:
+        """Return the outputs of the decoder's layers; `cells` are the encoded cells of all levels."""
         config = self.config
         embedding = self.param("queries", nn.initializers.normal(1.0), (config.queries, 2 * config.dim), jnp.float32)
         position, queries = jnp.split(embedding, 2, -1)
@@ -146,10 +155,10 @@ class ElementDecoder(nn.Module):
         reference = nn.sigmoid(nn.Dense(2, kernel_init=nn.initializers.xavier_uniform(), name="reference")(position))
         outputs = []
         for i in range(config.layers):
-            scale = jnp.tile(ratios, (1, reference.shape[-1] // 2))
+            scale = jnp.tile(ratios, (1, reference.shape[-1] // 2))  # (x, y) of a point; of a box (x, y, x, y)
             around = reference[:, None, None] * scale[None, None]
             layer = partial(ElementDecoderLayer, config, name=f"decoder_{i}")
-            given = queries, position, memory, around, valid
+            given = queries, position, cells, around, valid
             queries = run_layer(self, layer, config, *given, shapes=shapes, deterministic=deterministic)
             logits = nn.Dense(self.classes, bias_init=nn.initializers.constant(-np.log(99.0)), name=f"class_{i}")(
                 queries
@@ -157,7 +166,7 @@ class ElementDecoder(nn.Module):
             box = ElementBox(config.dim, first=i == 0, name=f"box_{i}")(queries, reference)
             reference = lax.stop_gradient(box)
             outputs.append(ElementOutput(queries, corners(box, size), logits))
-        return ElementOutput(*(jnp.stack(leaf) for leaf in zip(*map(_leaves, outputs), strict=True)))
+        return jax.tree.map(lambda *leaves: jnp.stack(leaves), *outputs)
 
 
 class ElementEncoderLayer(nn.Module):
@@ -166,8 +175,17 @@ class ElementEncoderLayer(nn.Module):
     config: ElementDecoderConfig
 
     @nn.compact
-    def __call__(self, tokens, position, around, valid: Bool[Array, " t"], *, shapes, deterministic: bool):
-        """Return the tokens (T, C) after the layer."""
+    def __call__(
+        self,
+        tokens: Float[Array, "t c"],
+        position: Float[Array, "t c"],
+        around: Float[Array, "t 1 levels 2"],
+        valid: Bool[Array, " t"],
+        *,
+        shapes: Sequence[tuple[int, int]],
+        deterministic: bool,
+    ) -> Float[Array, "t c"]:
+        """Return the cells' tokens after the layer; `around` are their own places on every level, in [0, 1]."""
         config, sizes = self.config, _sizes(self.config)
         attend = DeformableAttention(config.dim, config.heads, config.sampling_points, config.levels, name="attention")
         block = FeedForward(sizes, name="feed_forward")
@@ -186,9 +204,20 @@ class ElementDecoderLayer(nn.Module):
 
     @nn.compact
     def __call__(
-        self, queries, position, memory, around, valid: Bool[Array, " t"], *, shapes, deterministic: bool
+        self,
+        queries: Float[Array, "e c"],
+        position: Float[Array, "e c"],
+        cells: Float[Array, "t c"],
+        around: Float[Array, "e 1 levels d"],
+        valid: Bool[Array, " t"],
+        *,
+        shapes: Sequence[tuple[int, int]],
+        deterministic: bool,
     ) -> Float[Array, "e c"]:
-        """Return the queries after the layer."""
+        """Return the queries after the layer.
+
+        `cells` are the encoded cells of all levels; `around` are points (D = 2) or boxes (D = 4) on every level.
+        """
         config, sizes = self.config, _sizes(self.config)
         attend = MultiHeadAttention(config.dim, config.heads, config.dropout, name="self_attention")
         sample = DeformableAttention(config.dim, config.heads, config.sampling_points, config.levels, name="attention")
@@ -198,7 +227,7 @@ class ElementDecoderLayer(nn.Module):
             return attend(x + position, x + position, x, deterministic=deterministic)
 
         def to_image(x):
-            return sample(x + position, memory, shapes, around, valid)
+            return sample(x + position, cells, shapes, around, valid)
 
         queries = Residual(sizes, name="attended")(queries, among_queries, deterministic=deterministic)
         queries = Residual(sizes, name="crossed")(queries, to_image, deterministic=deterministic)
@@ -259,7 +288,3 @@ def corners(box: Float[Array, "e 4"], size: Int[Array, " 2"]) -> Float[Array, "e
 
 def _sizes(config: ElementDecoderConfig) -> TransformerConfig:
     return TransformerConfig(config.heads, config.hidden, config.dropout)
-
-
-def _leaves(output: ElementOutput):
-    return output.queries, output.box, output.logits

@@ -102,13 +102,13 @@ class EvidenceEncoder(nn.Module):
         with computing(self.config.precision):
             x = nn.Conv(self.config.dim, (3, 3), name="stem")(x)
         x = nn.relu(_norm("stem_norm")(x))
-        fused = 0
+        first = 0  # what priors count as the layer of the first residual block
         if self.config.levels:
-            x, fused = fuse_priors(fuse, fused, x, partial(_positions, x)), 1
+            x, first = fuse_priors(fuse, 0, x, partial(_positions, x)), 1
             x = run_layer(self, partial(UNet, self.config.levels, name="context"), self.config, x)
         for i, dilation in enumerate(self.config.dilations):
             x = run_part(self, partial(_block, i, dilation), self.config, x)
-            x = fuse_priors(fuse, fused + i, x, partial(_positions, x))
+            x = fuse_priors(fuse, first + i, x, partial(_positions, x))
         if self.config.cells:
             LaneCellHead(name="cells")(x)
         return x

@@ -147,8 +147,9 @@ def spread_lanes(count: int, points: int, range_: PerceptionRange, length: float
     """
     sample = np.stack([_radical_inverse(np.arange(1, count + 1), base) for base in (2, 3, 5)], -1)
     middle = np.asarray(range_.low(2)) + sample[:, :2] * np.asarray(range_.size(2))
-    fraction = sample[:, 2] / 0.6
-    heading = np.where(fraction < 1.0, np.pi * (fraction < 0.5), 2 * np.pi * (sample[:, 2] - 0.6) / 0.4)
+    fraction = sample[:, 2] / 0.6  # below 0.5: against x; below 1: along x; above: any direction
+    along_x = np.where(fraction < 0.5, np.pi, 0.0)
+    heading = np.where(fraction < 1.0, along_x, 2 * np.pi * (sample[:, 2] - 0.6) / 0.4)
     along = np.linspace(-length / 2, length / 2, points)
     direction = np.stack([np.cos(heading), np.sin(heading)], -1)
     lanes = np.zeros((count, points, 3), np.float32)

@@ -253,8 +253,7 @@ def cell_numbers(
     """Return the number of the cell of each point, row by row; the number of cells for one outside the range or NaN."""
     count = jnp.array([grid.columns, grid.rows, 1], jnp.float32).reshape((1,) * (points.ndim - 1) + (3,))
     place = grid.range.normalise(points) * count
-    lowest = -1.0 if border == "published" else 0.0
-    above = (place > lowest) if border == "published" else (place >= lowest)
+    above = place > -1.0 if border == "published" else place >= 0.0
     inside = (above & (place < count)).all(-1)
     column, row = (jnp.where(inside, place[..., axis], 0.0).astype(jnp.int32) for axis in (0, 1))
     return jnp.where(inside, row * grid.columns + column, grid.rows * grid.columns)

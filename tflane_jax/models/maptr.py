@@ -233,11 +233,14 @@ class MapTr(Host):
             tokens: of the priors, by name.
             deterministic: no dropout.
         """
-        config, spec, (queries, position, reference) = self.config.decoder, self.config.spec, start
-        (lines, points, dim), groups, outputs = queries.shape, self.groups(len(queries)), []
+        config, spec = self.config.decoder, self.config.spec
+        queries, position, reference = start
+        lines, points, dim = queries.shape
+        groups, outputs = self.groups(lines), []
         together = points_together = None
         if (same := same_group(groups)) is not None:
-            together, points_together = jnp.asarray(same), jnp.asarray(np.kron(same, np.ones((points, points), bool)))
+            together = jnp.asarray(same)
+            points_together = jnp.asarray(np.kron(same, np.ones((points, points), bool)))  # (I P, I P), by point
         sizes = tuple(count * points for count in groups)
         for i in range(config.layers):
             placed = point_position(config, i, position, reference)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -66,8 +66,6 @@ _NEAR = 0.5
 _ENTRIES, _ROW = 7, 0.16
 # Images smaller than this are shown with sharp pixels.
 _PIXELATED = 400
-
-Tree = TypeVar("Tree")
 
 
 def save_camera_views(

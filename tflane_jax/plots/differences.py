@@ -89,8 +89,9 @@ def save_differences(
     figure, axes = new_figure(len(titles), 2 + len(models), panel=size, footer=1.5)
     shown = next((findings.lanes for findings in models.values()), None)
     figure.suptitle(title, fontsize=13, x=0.01, ha="left")
-    for row, (line, name) in enumerate(zip(axes, titles, strict=True)):
-        example, (truth, seen, *places) = row_of(examples, row), line
+    for row, (panels, name) in enumerate(zip(axes, titles, strict=True)):
+        example = row_of(examples, row)
+        truth, seen, *places = panels
         lanes = truth_lines(example, shown)
         draw_scene(
             truth,
@@ -105,9 +106,9 @@ def save_differences(
             draw_outlines(ax, lanes[outlined[row]])
         for ax, (model, findings) in zip(places, models.items(), strict=True):
             found = findings.found[row] & outlined[row]
-            name = textwrap.fill(f"{model}: finds {found.sum()} of {outlined[row].sum()} outlined", _TITLE)
+            heading = textwrap.fill(f"{model}: finds {found.sum()} of {outlined[row].sum()} outlined", _TITLE)
             prediction = row_of(findings.lanes, row)
-            draw_found(ax, example, prediction, ground=ground, view=view, threshold=findings.threshold, title=name)
+            draw_found(ax, example, prediction, ground=ground, view=view, threshold=findings.threshold, title=heading)
             draw_outlines(ax, lanes[found], "filled")
             draw_outlines(ax, lanes[outlined[row] & ~found], "dashed")
     label_edges(axes)

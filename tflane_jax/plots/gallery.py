@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, TypeVar
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -36,8 +36,6 @@ _SMALL_PANEL_WIDTH, _SMALL_PANEL_DPI = 3.4, 150
 _FOOTER = 0.9
 # More panels than this are wrapped to the next line.
 _MOST_COLUMNS = 7
-
-Tree = TypeVar("Tree")
 
 
 def save_examples(

@@ -155,30 +155,46 @@ def remember(
             f"the memory is MarkerMemory.empty{size}, and the configuration (frames) and what is observed (lanes and "
             f"their points) need MarkerMemory.empty{wanted}"
         )
+    bank = _advance(memory, observed, previous_from_ego, has_previous, config)
+    return bank, _read(bank, observed, config)
+
+
+def _advance(
+    memory: MarkerMemory,
+    observed: MarkerLanes,
+    previous_from_ego: Float[Array, "4 4"],
+    has_previous: Bool[Array, ""],
+    config: MarkerMemoryConfig,
+) -> MarkerMemory:
+    """Return the bank with this frame in slot 0 and every earlier one a slot further, in the present ego frame."""
     kept = memory.valid & has_previous
     points = memory.points
     if config.compensation == "ego_motion":
         own = jnp.asarray(previous_from_ego, points.dtype)  # the bank keeps its dtype, also in 64-bit mode
         points = _to_present(points, jnp.where(has_previous, own, jnp.eye(4, dtype=points.dtype)))
-    bank = MarkerMemory(
+    return MarkerMemory(
         points=_push(observed.points, jnp.where(kept[..., None, None], points, 0.0)),
         confidence=_push(observed.confidence, jnp.where(kept, memory.confidence, 0.0)),
         successor=_push(observed.successor, memory.successor & kept[..., None]),
         valid=_push(observed.valid, kept),
     )
+
+
+def _read(bank: MarkerMemory, observed: MarkerLanes, config: MarkerMemoryConfig) -> MarkerGuidance:
+    """Return the guidance of a frame: the union of all slots if it reads the bank, else its own lanes (slot 0)."""
     age = jnp.arange(config.frames)
     decayed = bank.confidence * (config.decay**age).astype(bank.confidence.dtype)[:, None]  # c-hat of III-C
     alone = guidance(observed, config.exponent)
-    retrieve = jnp.asarray(reads_bank(observed, config))
+    reads = jnp.asarray(reads_bank(observed, config))
     strongest = decayed.max(initial=0.0)
     scale = jnp.where(strongest > 0, strongest, 1.0) if config.gate == "once" else 1.0
-    # Eq. (4), or the frame alone, of which only slot 0 is used.
-    weight = jnp.where(retrieve, _power(decayed / scale, config.exponent), alone.weight[None])
-    from_bank = jnp.where(strongest > 0, 1.0, 0.0) if config.gate == "one" else strongest
-    used = bank.valid & (retrieve | (age == 0))[:, None]
-    gate = jnp.where(retrieve, from_bank, alone.gate)
-    weight, decayed = (jnp.where(used, each, 0.0) for each in (weight, decayed))
-    return bank, _union(bank, weight, decayed, used, gate, config.lanes)
+    of_union = _power(decayed / scale, config.exponent)  # Eq. (4)
+    gate_of_union = jnp.where(strongest > 0, 1.0, 0.0) if config.gate == "one" else strongest
+    used = bank.valid & (reads | (age == 0))[:, None]
+    # The frame's own weights stand in every slot; `used` leaves those of slot 0.
+    weight = jnp.where(used, jnp.where(reads, of_union, alone.weight[None]), 0.0)
+    gate = jnp.where(reads, gate_of_union, alone.gate)
+    return _union(bank, weight, jnp.where(used, decayed, 0.0), used, gate, config.lanes)
 
 
 def reads_bank(observed: MarkerLanes, config: MarkerMemoryConfig) -> Bool[Array, ""]:

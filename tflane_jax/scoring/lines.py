@@ -19,7 +19,10 @@ _Place = tuple[Any, str, int]
 
 
 def unusual(predictions: Mapping[Any, Any], truth: Mapping[Any, Any]) -> list[str]:
-    """Return remarks on lines that no score can be meant for; frames hold lanes, segments or lines of a map."""
+    """Return remarks on lines that make a score meaningless; frames hold lanes, segments or lines of a map.
+
+    They are: no lines at all, lines without length, true lines that are there twice.
+    """
     return [
         *no_lines("predictions", map(_lines_of, predictions.values())),
         *no_lines("ground truth", map(_lines_of, truth.values())),
@@ -87,7 +90,10 @@ def _twice(truth: Mapping[Any, Any]) -> list[str]:
     for key, frame in truth.items():
         for name, things in _identities(frame):
             seen = set()
-            again += [(key, name, i) for i, thing in enumerate(things) if thing in seen or seen.add(thing)]
+            for i, thing in enumerate(things):
+                if thing in seen:
+                    again.append((key, name, i))
+                seen.add(thing)
     if not again:
         return []
     return [f"{len(again)} true lines or things are there twice, {_places(again)}: a prediction finds only one of them"]

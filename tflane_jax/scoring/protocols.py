@@ -42,8 +42,8 @@ class ScoringProtocol:
             are by group.
         of_scene: returns the numbers of the accumulator of one scene, which may lack what the whole has.
         remarks: returns what is unusual, though not wrong, about predictions and truth.
-        found: that one of the numbers which is 0 exactly if no predicted line is near a true one; "" for none.
-        frame: axes, units and frame of the lines, or what else to look at, for a remark where none is near.
+        zero_score: name of the score that is 0 exactly if no predicted line is near a true one; "" for none.
+        look_at: what a user should look at then, the end of the remark: axes, units and frame of the lines.
         no_scenes: why `scene_of` separates frames of one drive; "" if it does not.
     """
 
@@ -56,8 +56,8 @@ class ScoringProtocol:
     groups: Mapping[str, Callable[[], Any]] = field(default_factory=dict)
     of_scene: Callable[[Any], dict[str, Any]] = numbers_of
     remarks: remarks.Remarks = remarks.no_remarks
-    found: str = ""
-    frame: str = "x forward, y left, z up, metres in the vehicle's frame"
+    zero_score: str = ""
+    look_at: str = "x forward, y left, z up, metres in the vehicle's frame"
     no_scenes: str = ""
 
     def read(self, predictions: Path, truth: Path) -> tuple[Mapping[Any, Any], Mapping[Any, Any]]:
@@ -111,7 +111,7 @@ def _centerline(version: Version) -> ScoringProtocol:
         columns=("OLS", "DET_l", "DET_t", "TOP_ll", "TOP_lt"),
         formats=("OpenLane-V2 centerlines", "plain centerlines"),
         remarks=remarks.centerlines,
-        found="recall",
+        zero_score="recall",
         groups=_groups(metrics),
     )
 
@@ -127,7 +127,7 @@ def _lane_segment(flavour: Flavour, columns: tuple[str, ...]) -> ScoringProtocol
         formats=("OpenLane-V2 lane segments",),
         of_scene=lambda metrics: metrics.compute("frames"),
         remarks=remarks.segments,
-        found=columns[1],
+        zero_score=columns[1],
         groups=_groups(metrics),
     )
 
@@ -144,8 +144,8 @@ def _maptr(sampling: Sampling, measure: Measure = "chamfer", dims: Dims = 2) -> 
         formats=("MapTR",),
         of_scene=lambda metrics: metrics.compute("frames"),
         remarks=remarks.units,
-        found="mAP",
-        frame="and are the classes right",
+        zero_score="mAP",
+        look_at="and are the classes right",
         groups=_groups(metrics),
     )
 
@@ -174,7 +174,7 @@ PROTOCOLS: dict[str, ScoringProtocol] = {
         columns=("F_score", "F_recall", "F_precision"),
         groups={},
         remarks=remarks.units,
-        found="F_recall",
+        zero_score="F_recall",
     ),
     "maptr": _maptr("maptr"),
     "maptrv2": _maptr("maptrv2"),

@@ -171,7 +171,10 @@ def _check_frames(predictions: Mapping[Hashable, Any], truth: Mapping[Hashable, 
 
 
 def _prefix(ours: Mapping[Hashable, Any], other: Mapping[Hashable, Any]) -> str:
-    """Return by what in front, in words, all names of `ours` differ from those of `other`; "" if not only by that."""
+    """Return what stands before every name of `ours` and not in `other`, such as "the prefix images/".
+
+    Returns "" if the names differ in more than that.
+    """
     if not all(isinstance(name, str) for name in (*ours, *other)) or ours.keys() <= other.keys():
         return ""
     names = [str(name).replace("\\", "/") for name in ours]

@@ -129,7 +129,8 @@ class LaneGraphTask(Task[Example, Example | Streamed, LaneGraphSource, HostMemor
         module, start = self.model.build(), self.start()
         observations = jax.vmap(self._observations)(batch)
 
-        def frame(bev, statistics, example, observations, key):
+        def run_frame(bev, statistics, example, observations, key):
+            """Return the BEV memory, the new statistics, and outputs, auxiliary outputs and counts of one frame."""
             variables, streams = {"params": learned} | statistics, {"dropout": key}
             kept, method = [STATISTICS, AUXILIARY, LOST], type(module).answer
             (outputs, bev), state = module.apply(
@@ -138,13 +139,13 @@ class LaneGraphTask(Task[Example, Example | Streamed, LaneGraphSource, HostMemor
             updated = {name: value for name, value in state.items() if name == STATISTICS}
             return bev, updated, (outputs, auxiliary_outputs(state), _lost(state))
 
-        def alone(example, observations, key):
-            _, updated, found = frame(None, statistics, example, observations, key)
+        def train_frame(example, observations, key):
+            _, updated, found = run_frame(None, statistics, example, observations, key)
             return found, updated
 
-        def clip(examples, observations, key):
+        def train_clip(examples, observations, key):
             def body(carry, now):
-                bev, updated, found = frame(*carry, *now)
+                bev, updated, found = run_frame(*carry, *now)
                 return (bev, updated), found
 
             frames = examples, observations, jax.random.split(key, self.clip)
@@ -152,15 +153,16 @@ class LaneGraphTask(Task[Example, Example | Streamed, LaneGraphSource, HostMemor
             (_, updated), found = lax.scan(body, (start.bev, statistics), frames, unroll=unroll)
             return found, updated
 
-        through_clips = self.loops or (self.clip > 1 and start.bev is not None)
+        # Frames of a clip run one after the other if they share BEV features, or if the program is to hold one of them.
+        through_clips = self.clip > 1 and (self.time == "scan" or start.bev is not None)
         if self.clip > 1 and not through_clips:
             # Without BEV memory, only the priors connect frames, and they have been observed already.
-            batch, observations = _frames((batch, observations))
+            batch, observations = _clips_as_frames((batch, observations))
         keys = jax.random.split(key, len(jax.tree.leaves(batch)[0]))
-        train: Any = jax.vmap(clip if through_clips else alone, axis_name=BATCH_AXIS, out_axes=(0, None))
+        train: Any = jax.vmap(train_clip if through_clips else train_frame, axis_name=BATCH_AXIS, out_axes=(0, None))
         (outputs, auxiliary, lost), updated = train(batch, observations, keys)
         if through_clips:
-            outputs, auxiliary, batch = _frames((outputs, auxiliary, batch))
+            outputs, auxiliary, batch = _clips_as_frames((outputs, auxiliary, batch))
         loss, report = checked_loss(self.losses, self.losses.loss(outputs, auxiliary, batch, self.model))
         return loss, report | {name: count.mean() for name, count in lost.items()} | updated
 
@@ -327,6 +329,6 @@ def _lost(state: Any) -> dict[str, Float[Array, ""]]:
     return {name: jnp.stack(of_layers).max().astype(jnp.float32) for name, of_layers in counts.items()}
 
 
-def _frames(clips: T) -> T:
+def _clips_as_frames(clips: T) -> T:
     """Return a batch of clips as a batch of frames: merge the two leading axes."""
     return jax.tree.map(lambda leaf: leaf.reshape(leaf.shape[0] * leaf.shape[1], *leaf.shape[2:]), clips)

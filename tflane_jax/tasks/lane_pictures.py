@@ -25,7 +25,7 @@ from tflane_jax.evaluation.found_lanes import (
     detection_scores,
     frames_of_difference,
 )
-from tflane_jax.evaluation.interventions import scene_numbers
+from tflane_jax.evaluation.interventions import example_scenes
 from tflane_jax.evaluation.lane_groups import lane_groups, line_groups
 from tflane_jax.evaluation.predict import FOR_PICTURES, predict_examples, predicted_batches
 from tflane_jax.scene import Example, LaneGraph, LanePrediction, MapLines, Prediction, stack_examples
@@ -74,7 +74,7 @@ def draw_hidden_lanes(
     from tflane_jax.plots import save_examples
 
     dataset = sources.open_dataset(source)
-    field = truth_of(next(iter(models.values())))
+    field = truth_field(next(iter(models.values())))
     if isinstance(data, Streamed):
         indices = spread(len(data), _FRAMES_OF_ONE_MODEL)
     else:
@@ -123,7 +123,7 @@ def draw_differences(
     from tflane_jax.plots import Findings, save_differences
 
     parts, answers = next(iter(models.values())).task.parts, {}
-    fields: list[Field] = sorted({truth_of(model) for model in models.values()})
+    fields: list[Field] = sorted({truth_field(model) for model in models.values()})
     if len(fields) > 1:
         raise UserError("these models predict lanes of different kinds: compare hosts of one kind")
     field = fields[0]
@@ -138,7 +138,7 @@ def draw_differences(
     members = _members(data, source, group, field, kinds)
     by_first, by_second = (members & answers[name].found for name in (first, second))
     alone = {first: by_first & ~by_second, second: by_second & ~by_first}
-    frames = frames_of_difference(alone[first].sum(1), alone[second].sum(1), scene_numbers(data), _FRAMES)
+    frames = frames_of_difference(alone[first].sum(1), alone[second].sum(1), example_scenes(data), _FRAMES)
     ahead = dict(zip((first, second), frames, strict=True))
     chosen = [*ahead[second], *ahead[first]] or np.argsort(-members.sum(1), kind="stable")[:_FRAMES].tolist()
 
@@ -202,10 +202,11 @@ def _members(
             lanes, bev, flow = jax.tree.map(
                 lambda leaf, i=row: np.asarray(leaf[i]), (getattr(batch, field), batch.bev, batch.traffic_flow)
             )
-            members = lanes.valid & _occluded(lanes)
-            if group != "occluded":
-                members, groups = np.zeros(len(lanes.valid), bool), _groups_of[type(lanes)]
-                members[lanes.valid] = groups(lanes, bev, flow, source.example.ground)[group]
+            if group == "occluded":
+                members = lanes.valid & _occluded(lanes)
+            else:
+                members = np.zeros(len(lanes.valid), bool)
+                members[lanes.valid] = _groups_of[type(lanes)](lanes, bev, flow, source.example.ground)[group]
             every.append(members & (lanes.category < kinds) if isinstance(lanes, MapLines) else members)
     return np.stack(every)
 
@@ -215,7 +216,7 @@ def _occluded(lanes: LaneGraph | MapLines) -> Bool[np.ndarray, "*b n"]:
     return np.zeros(lanes.valid.shape, bool) if lanes.visibility is None else np.asarray(lanes.visibility) < 0.5
 
 
-def truth_of(model: Model) -> Field:
+def truth_field(model: Model) -> Field:
     """Return the field of `Example` that holds the truth of what `Prediction.lanes` is for this model."""
     host: Any = getattr(model.task, "model", None)
     predicts = () if host is None else host.predicts

@@ -61,8 +61,8 @@ class PhotoLanes:
         lanes: (column, row) in pixels of the photo, from the upper to the lower end; from left to right.
         scores: of the lanes, 0 to 1.
         paint: fraction of each lane that lies on paint.
-        value: plausibility of the view: of one of many `plausibility`, otherwise that of `Judgement`. The two are no
-            numbers to compare.
+        value: `plausibility` of a view that was searched among many, `Judgement.value` of one that was given; their
+            scales differ, so do not compare them.
         warning: what is doubtful; "" if nothing is.
         needed: from which value the view is taken; None without a choice: the view was given, or the photo is empty.
     """
@@ -236,33 +236,30 @@ class PhotoReader:
         top = seen.view.top + HORIZON * seen.view.height if horizon is None else horizon
         if horizon is None and judged.meeting is not None and not judged.crossed:
             top = min(top, judged.meeting[1])
-        lanes, worth, kept = [], [], []
-        believed = np.flatnonzero(choice.believed)
-        for i in believed:
-            points = _inside(seen.view.to_photo(seen.lanes[i]), photo.shape, top)
-            if len(points) > 1:
-                lanes.append(points)
-                worth.append(float(seen.scores[i]) + judged.paint[i])
-                kept.append(i)
-        clear = without_crossings(lanes, worth, seen.view.width)
+        believed = np.flatnonzero(choice.believed).tolist()
+        points = {i: _inside(seen.view.to_photo(seen.lanes[i]), photo.shape, top) for i in believed}
+        inside = [i for i in believed if len(points[i]) > 1]
+        worth = [float(seen.scores[i]) + judged.paint[i] for i in inside]
+        clear = without_crossings([points[i] for i in inside], worth, seen.view.width)
+        shown = [i for i, keep in zip(inside, clear, strict=True) if keep]
         warnings = [] if horizon is None else misfits(seen.view, horizon)
-        if len(lanes) < len(believed):
-            warnings.append(f"{len(believed) - len(lanes)} of {len(believed)} lanes lie above the horizon or outside")
+        if len(inside) < len(believed):
+            lost = len(believed) - len(inside)
+            warnings.append(f"{lost} of {len(believed)} lanes lie above the horizon or outside")
         if not clear.all():
             warnings.append(f"lanes that cross others are left out ({int((~clear).sum())})")
         if judged.crossed and clear.all():
             warnings.append("the lanes would cross before the horizon")
         if seen.lanes and choice.value < plausible and not judged.crossed:
             warnings.append("the lanes hardly lie on paint or do not meet on the horizon: look at the picture")
-        shown = [k for k, keep in zip(range(len(lanes)), clear, strict=True) if keep]
         return PhotoLanes(
-            seen.view,
-            tuple(lanes[k] for k in shown),
-            tuple(float(seen.scores[kept[k]]) for k in shown),
-            tuple(judged.paint[kept[k]] for k in shown),
-            choice.value,
-            "; ".join(warnings),
-            choice.needed,
+            view=seen.view,
+            lanes=tuple(points[i] for i in shown),
+            scores=tuple(float(seen.scores[i]) for i in shown),
+            paint=tuple(judged.paint[i] for i in shown),
+            value=choice.value,
+            warning="; ".join(warnings),
+            needed=choice.needed,
         )
 
 

@@ -15,7 +15,6 @@ import importlib
 import importlib.abc
 import importlib.machinery
 import importlib.util
-import itertools
 import os
 import shlex
 import sys
@@ -70,21 +69,28 @@ def import_own() -> None:
         UserError: one of them cannot be imported.
     """
     for name in _named():
-        look_in(None)
+        _find_in_working_directory()
         try:
-            _ = import_file(Path(name)) if name.endswith(".py") else importlib.import_module(name)
+            if name.endswith(".py"):
+                import_file(Path(name))
+            else:
+                importlib.import_module(name)
         except (Exception, SystemExit) as error:
             raise UserError(
                 f"module {name} (--import or {VARIABLE}) cannot be imported: {type(error).__name__}: {error}"
             ) from error
 
 
-def look_in(folder: Path | None) -> None:
-    """Let modules of a folder be imported, None for the working directory; installed ones of the same name win."""
-    with contextlib.suppress(FileNotFoundError):  # the working directory may be gone
-        path = os.getcwd() if folder is None else str(folder)
-        if path not in sys.path and (folder is not None or "" not in sys.path):
-            sys.path.append(path)
+def _find_in(folder: str) -> None:
+    """Let modules of a folder be imported; installed ones of the same name win."""
+    if folder not in sys.path:
+        sys.path.append(folder)
+
+
+def _find_in_working_directory() -> None:
+    with contextlib.suppress(FileNotFoundError):  # it may be gone
+        if "" not in sys.path:  # which stands for it
+            _find_in(os.getcwd())
 
 
 def import_file(path: Path, *, beside: bool = True) -> ModuleType:
@@ -98,8 +104,8 @@ def import_file(path: Path, *, beside: bool = True) -> ModuleType:
     if str(path) not in known:
         os.environ[_FILES] = "\n".join([*known, str(path)])
     if beside:
-        look_in(None)
-        look_in(path.parent)
+        _find_in_working_directory()
+        _find_in(str(path.parent))
         _beside.add(str(path.parent))
     return importlib.import_module(_module_name(path))
 
@@ -124,31 +130,31 @@ def _importable(module: str) -> str:
 
 
 def own_content(config: Any) -> str:
-    """Return the hash of a configuration's own modules; "" where all its classes are the package's.
+    """Return a hash of the code of a configuration's own modules, and of the paths of those imported as files.
 
-    They are those that define its own classes, and the modules of the user's that these import (`_own_modules`).
+    They define its own classes, or are the user's and imported by such modules (`_own_modules`). "" for none.
     """
     modules = sorted(_own_modules(config))
     return hashlib.sha256("".join(map(_content, modules)).encode()).hexdigest() if modules else ""
 
 
 def own_code(config: Any) -> str:
-    """Return the hash of the code of a configuration's own modules, wherever their files lie; "" for none."""
+    """Return a hash of the code of a configuration's own modules alone, wherever their files lie; "" for none."""
     hashes = sorted(filter(None, map(_code_of, _own_modules(config))))
     return hashlib.sha256("".join(hashes).encode()).hexdigest() if hashes else ""
 
 
 @functools.cache
 def _code_of(module: str) -> str:
-    """Return the hash of a module's file when it was first asked for: one edited later is not the code that runs."""
+    """Return the hash of a module's file as it was when first asked for: code edited later is not what runs."""
     file = getattr(sys.modules[module], "__file__", None)
     return "" if file is None else hashlib.sha256(Path(file).read_bytes()).hexdigest()
 
 
 @functools.cache
 def _content(module: str) -> str:
-    """Return what tells the code of a module from its other states, of one that is edited later the code that runs."""
-    if module.startswith(_PREFIX):  # its name does
+    """Return a text that changes with a module: of a file, its name, made from path and content; else `_code_of`."""
+    if module.startswith(_PREFIX):
         return module
     return _code_of(module)
 
@@ -158,7 +164,8 @@ def _own_modules(config: Any) -> set[str]:
 
     What a function imports when it is called is left out, because it is known only then.
     """
-    left, found = [kind.__module__ for kind in _classes(config) if is_own(kind)], set()
+    left = [kind.__module__ for kind in _classes(config) if is_own(kind)]
+    found: set[str] = set()
     while left:
         if (name := left.pop()) not in found:
             found.add(name)
@@ -176,7 +183,9 @@ def _imports(module: str) -> tuple[str, ...]:
         tree = ast.parse(Path(file).read_bytes())
     except (OSError, SyntaxError, ValueError):  # edited since, or no source
         return ()
-    found, left, package = set[str](), list[ast.AST](tree.body), sys.modules[module].__package__ or ""
+    found: set[str] = set()
+    left: list[ast.AST] = list(tree.body)
+    package = sys.modules[module].__package__ or ""
     while left:
         node = left.pop()
         if isinstance(node, ast.Import):
@@ -186,8 +195,13 @@ def _imports(module: str) -> tuple[str, ...]:
             found |= {base, *(f"{base}.{one.name}" for one in node.names)}
         elif not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda) and not _for_types(node):
             left += ast.iter_child_nodes(node)
-    # `import a.b` also runs a.
-    return tuple(sorted({outer for name in found for outer in itertools.accumulate(name.split("."), "{}.{}".format)}))
+    return tuple(sorted({outer for name in found for outer in _with_packages(name)}))
+
+
+def _with_packages(name: str) -> list[str]:
+    """Return a module's name and those of the packages around it, which its import also runs: a, a.b and a.b.c."""
+    parts = name.split(".")
+    return [".".join(parts[:count]) for count in range(1, len(parts) + 1)]
 
 
 def _for_types(node: ast.AST) -> bool:

@@ -93,7 +93,7 @@ def test_a_file_that_scenes_share_is_read_once(tmp_path, monkeypatch):
         ("log", "[3]", r"log\.json: a row is of type int"),
         ("log", '[{"token": [1], "location": "x"}]', r"log\.json: token is \[1\], expected text"),
         ("scene", '[{"name": "x", "log_token": {}}]', r"scene\.json: log_token is {}, expected text"),
-        ("scene", '[{"name": null, "log_token": "x"}]', r"scene\.json: name is None, expected text"),
+        ("scene", '[{"name": null, "log_token": "x"}]', r"scene\.json: name is None, expected a name"),
     ],
 )
 def test_damaged_tables_of_scenes_are_named(tmp_path, table, content, message):

@@ -7,13 +7,13 @@ import pytest
 
 from tflane_jax.errors import UserError
 from tflane_jax.files.fields import (
-    choices,
     file_within,
     fractions,
     load_json,
     load_members,
     member,
     numbers,
+    truth_values,
     whole_number,
 )
 
@@ -100,7 +100,7 @@ ROWS = [[0.0] * 10_000] * 10_000
         (numbers, [0.0, doubled([0.0] * 100_000, 10)]),
         (numbers, [np.zeros(100_000)] * 1000),
         (numbers, cycle()),
-        *((read, ROWS) for read in (numbers, choices, fractions)),
+        *((read, ROWS) for read in (numbers, truth_values, fractions)),
     ],
     ids=["doubled", "behind a number", "arrays", "cycle", *("rows" for _ in range(3))],
 )

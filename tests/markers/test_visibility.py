@@ -7,7 +7,7 @@ import pytest
 
 from tests.markers.test_simulation import markers_at, standing
 from tflane_jax.geometry import invert_pose, yaw_pose
-from tflane_jax.markers.visibility import hidden_from, in_image, seen_fraction
+from tflane_jax.markers.visibility import fraction_in_sight, hidden_from, in_image, seen_fraction
 from tflane_jax.world.cameras.ring import ARGOVERSE2_RING, NUSCENES_RING, CameraRigConfig, draw_rig
 from tflane_jax.world.roads.markers import marker_pose
 
@@ -85,7 +85,7 @@ def test_road_users_keep_their_heading_on_the_ground():
     turned = yaw_pose(*np.array([[0.0], [0.0], [np.pi / 2]]))[0]
     moment = replace(scene.keyframes[0], global_from_ego=turned)
     board = invert_pose(turned) @ marker_pose(np.array([[20.0, 0.0, 3.0]]), np.array([np.pi]))
-    seen = seen_fraction(scene, moment, board, 1.0, FRONT, np.zeros((0, 7)), framed=False)
+    seen = fraction_in_sight(scene, moment, board, 1.0, FRONT, np.zeros((0, 7)))
     assert seen[0] > 0.8
 
 

@@ -264,7 +264,7 @@ def scores(values: Sequence[Any], where: str) -> np.ndarray:
 
 def fractions(value: Any, shape: tuple[int | None, ...], where: str, *, largest: float = 1.0) -> np.ndarray:
     """Return an array of numbers from 0 to 1, or to another largest one; truth values count as such."""
-    array = numbers(_as_integers(value, shape, where), shape, where)
+    array = numbers(_as_numbers(value, shape, where), shape, where)
     if (outside := (array < 0.0) | (array > largest)).any():
         index = tuple(int(i) for i in np.argwhere(outside)[0])
         number = f"number {index[0]}" if len(index) == 1 else f"entry {list(index)}"
@@ -280,17 +280,17 @@ def _remedy(array: np.ndarray) -> str:
     return " (apply the sigmoid first)" if array.min() < 0.0 else ""
 
 
-def choices(value: Any, shape: tuple[int | None, ...], where: str) -> np.ndarray:
+def truth_values(value: Any, shape: tuple[int | None, ...], where: str) -> np.ndarray:
     """Return an array of truth values, which the file may give as 0 and 1."""
-    array = numbers(_as_integers(value, shape, where), shape, where)
+    array = numbers(_as_numbers(value, shape, where), shape, where)
     if (other := (array != 0) & (array != 1)).any():
         index = tuple(int(i) for i in np.argwhere(other)[0])
         raise UserError(f"{where} holds {digits(array[index])}{place(index)}, expected 0 or 1")
     return array == 1
 
 
-def _as_integers(value: Any, shape: tuple[int | None, ...], where: str) -> Any:
-    """Return numbers and truth values as an array; anything else as it is."""
+def _as_numbers(value: Any, shape: tuple[int | None, ...], where: str) -> Any:
+    """Return numbers as an array, truth values as 0 and 1; anything else as it is, for `numbers` to refuse."""
     _check_size(value, shape, where)
     try:
         array = np.asarray(value)

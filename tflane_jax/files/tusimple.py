@@ -51,15 +51,15 @@ def read_predictions(path: Path) -> dict[str, RowLanes]:
 
     Rows that a record repeats from the labels are kept, so that they can be compared.
     """
-    found = {name: _lanes(record, where, timed=True) for name, record, where in _records(path)}
-    _check_pixels(found, path)
+    found = {name: _lanes(record, where, predicted=True) for name, record, where in _records(path)}
+    _check_not_fractions(found, path)
     return found
 
 
 def read_truth(path: Path) -> dict[str, RowLanes]:
     """Return the labelled lanes by `raw_file`; raises UserError that names file, line and field."""
-    found = {name: _lanes(record, where, timed=False) for name, record, where in _records(path)}
-    _check_pixels(found, path)
+    found = {name: _lanes(record, where, predicted=False) for name, record, where in _records(path)}
+    _check_not_fractions(found, path)
     return found
 
 
@@ -99,24 +99,33 @@ def _records(path: Path) -> list[tuple[str, Any, str]]:
     return records
 
 
-def _lanes(record: Any, where: str, *, timed: bool) -> RowLanes:
-    time = 0.0
-    if timed:
-        time = float(numbers(member(record, "run_time", where), (), f"{where}: run_time"))
-        if time < 0.0:
-            raise UserError(f"{where}: run_time is {time:g}, expected milliseconds")
-    rows = _rows(record, where) if not timed or "h_samples" in record else None
-    if rows is not None and not timed and not len(rows):
-        raise UserError(f"{where}: h_samples is empty, expected the rows of the image at which lanes are labelled")
+def _lanes(record: Any, where: str, *, predicted: bool) -> RowLanes:
+    """Return the lanes of a record. A prediction has a run time and may leave out the rows; a label needs rows."""
+    if predicted:
+        run_time = _run_time(record, where)
+        rows = _rows(record, where) if "h_samples" in record else None
+    else:
+        run_time, rows = 0.0, _rows(record, where)
+        if not len(rows):
+            raise UserError(f"{where}: h_samples is empty, expected the rows of the image at which lanes are labelled")
+    count = None if rows is None else len(rows)
     lanes = [
-        numbers(lane, (None if rows is None else len(rows),), f"{where}: lanes[{i}]", largest=_WIDEST)
+        numbers(lane, (count,), f"{where}: lanes[{i}]", largest=_WIDEST)
         for i, lane in enumerate(items(record, "lanes", where))
     ]
     if other := [i for i, lane in enumerate(lanes) if len(lane) != len(lanes[0])]:
         sizes = f"{len(lanes[other[0]])} numbers, lanes[0] has {len(lanes[0])}"
         raise UserError(f"{where}: lanes[{other[0]}] has {sizes}: expected one x for each of h_samples")
-    height = len(lanes[0]) if lanes else 0 if rows is None else len(rows)
-    return RowLanes(np.array(lanes, np.float64).reshape(len(lanes), height), rows, time, where)
+    if count is None:
+        count = len(lanes[0]) if lanes else 0
+    return RowLanes(np.array(lanes, np.float64).reshape(len(lanes), count), rows, run_time, where)
+
+
+def _run_time(record: Any, where: str) -> float:
+    time = float(numbers(member(record, "run_time", where), (), f"{where}: run_time"))
+    if time < 0.0:
+        raise UserError(f"{where}: run_time is {time:g}, expected milliseconds")
+    return time
 
 
 def _rows(record: Any, where: str) -> Float[np.ndarray, " h"]:
@@ -130,7 +139,7 @@ def _rows(record: Any, where: str) -> Float[np.ndarray, " h"]:
     return rows
 
 
-def _check_pixels(lanes: dict[str, RowLanes], path: Path) -> None:
+def _check_not_fractions(lanes: dict[str, RowLanes], path: Path) -> None:
     """Raise UserError if every x of a file is a fraction of the image's width."""
     present = [one.x[one.x >= 0.0] for one in lanes.values()]
     x = np.concatenate([np.zeros(0), *present])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -219,49 +220,74 @@ def clip_to_range(points: Float[np.ndarray, "n d"], range_: PerceptionRange) -> 
     points = np.asarray(points, np.float64)
     if len(points) < 2:
         return []
-    within = range_.contains(points)
-    if within.all():
+    inside = range_.contains(points)
+    if inside.all():
         return [points] if _has_length(points) else []
-    both = within[:-1] & within[1:]
+    whole = inside[:-1] & inside[1:]  # segments
     # Of the other segments, only those can meet the box that do not lie beyond one of its four borders.
     (x0, x1), (y0, y1) = range_.x, range_.y
     x, y = points[:, 0], points[:, 1]
     beyond = np.stack([x < x0, x > x1, y < y0, y > y1])
-    cut = {}
-    for i in np.flatnonzero(~(both | (beyond[:, :-1] & beyond[:, 1:]).any(0))).tolist():
-        if (ends := _cut(points[i], points[i + 1], range_)) is not None:
-            cut[i] = ends
-    return [p for p in _pieces(points, both, cut) if _has_length(p)]
+    may_meet = ~(whole | (beyond[:, :-1] & beyond[:, 1:]).any(0))
+    cuts = {}
+    for i in np.flatnonzero(may_meet).tolist():
+        if (cut := _cut(points[i], points[i + 1], range_)) is not None:
+            cuts[i] = cut
+    return [piece for piece in _pieces(points, whole, cuts) if _has_length(piece)]
 
 
-def _pieces(
-    points: np.ndarray, both: np.ndarray, cut: dict[int, tuple[np.ndarray, np.ndarray, bool, bool]]
-) -> list[np.ndarray]:
+class _Cut(NamedTuple):
+    """The part of a segment inside the box.
+
+    Attributes:
+        enter, leave: (d,) its ends.
+        from_start, to_end: whether these are the start and the end of the segment.
+    """
+
+    enter: np.ndarray
+    leave: np.ndarray
+    from_start: bool
+    to_end: bool
+
+
+class _Axis(NamedTuple):
+    """Borders of the box and ends of a segment on one axis, metres."""
+
+    low: float
+    high: float
+    start: float
+    stop: float
+
+
+def _pieces(points: np.ndarray, whole: np.ndarray, cuts: dict[int, _Cut]) -> list[np.ndarray]:
     """Return the pieces of a line inside the box.
 
     Args:
         points: the line.
-        both: for each segment, whether both of its ends are inside.
-        cut: by number, the segments that the border cuts: where they enter and leave, and whether these are their ends.
+        whole: for each segment, whether all of it is inside.
+        cuts: by number of the segment, the parts of those that the border cuts.
     """
     pieces: list[list[np.ndarray]] = []
-    i, count, goes_on = 0, len(both), False
-    stops = np.append(np.flatnonzero(~both), count)
-    while i < count:
-        if both[i]:
+    stops = np.append(np.flatnonzero(~whole), len(whole))
+    connected = False  # whether the last piece ends where segment i starts
+    i = 0
+    while i < len(whole):
+        if whole[i]:
             # A run of segments inside: all of its vertices at once.
-            j = int(stops[np.searchsorted(stops, i)])
-            start, inner, begins, ends = points[i : i + 1], points[i + 1 : j + 1], True, True
-        elif i in cut:
-            (enter, leave, begins, ends), j = cut[i], i + 1
-            start, inner = enter[None], leave[None]
+            after = int(stops[np.searchsorted(stops, i)])
+            start, rest = points[i : i + 1], points[i + 1 : after + 1]
+            from_start = to_end = True
+        elif (cut := cuts.get(i)) is not None:
+            after = i + 1
+            start, rest = cut.enter[None], cut.leave[None]
+            from_start, to_end = cut.from_start, cut.to_end
         else:
-            i, goes_on = i + 1, False
+            i, connected = i + 1, False
             continue
-        if not (goes_on and begins):
+        if not (connected and from_start):
             pieces.append([start])
-        pieces[-1].append(inner)
-        i, goes_on = j, ends
+        pieces[-1].append(rest)
+        i, connected = after, to_end
     return [np.concatenate(parts) for parts in pieces]
 
 
@@ -269,15 +295,18 @@ def _has_length(points: np.ndarray) -> bool:
     return bool((points[1:, :2] != points[:-1, :2]).any())
 
 
-def _cut(a: np.ndarray, b: np.ndarray, range_: PerceptionRange) -> tuple[np.ndarray, np.ndarray, bool, bool] | None:
-    """Return where a segment enters and leaves the box (Liang-Barsky), and whether at its ends.
+def _cut(a: np.ndarray, b: np.ndarray, range_: PerceptionRange) -> _Cut | None:
+    """Return the part of a segment inside the box (Liang-Barsky).
 
     None if it is outside or only touches the border: a vertex there belongs to the neighbour that goes inside.
     """
     enter, leave = 0.0, 1.0
     # Plain floats: an array operation on one segment costs more than all of this.
-    ends = list(zip((range_.x, range_.y), a[:2].tolist(), b[:2].tolist(), strict=True))
-    for (low, high), start, stop in ends:
+    axes = [
+        _Axis(*borders, start, stop)
+        for borders, start, stop in zip((range_.x, range_.y), a[:2].tolist(), b[:2].tolist(), strict=True)
+    ]
+    for low, high, start, stop in axes:
         if stop == start:
             if not low <= start <= high:
                 return None
@@ -286,19 +315,17 @@ def _cut(a: np.ndarray, b: np.ndarray, range_: PerceptionRange) -> tuple[np.ndar
         enter, leave = max(enter, min(t0, t1)), min(leave, max(t0, t1))
     if enter >= leave:
         return None
-    return _on_segment(a, b, enter, ends), _on_segment(a, b, leave, ends), enter == 0.0, leave == 1.0
+    return _Cut(_on_segment(a, b, enter, axes), _on_segment(a, b, leave, axes), enter == 0.0, leave == 1.0)
 
 
-def _on_segment(
-    a: np.ndarray, b: np.ndarray, t: float, ends: list[tuple[tuple[float, float], float, float]]
-) -> np.ndarray:
+def _on_segment(a: np.ndarray, b: np.ndarray, t: float, axes: list[_Axis]) -> np.ndarray:
+    """Return the point at a fraction t of a segment; one on the border lies exactly there, despite rounding."""
     if t in (0.0, 1.0):
         return b if t else a
     point = a + t * (b - a)
-    # Despite rounding, a cut end lies exactly on the border.
-    for axis, (borders, start, stop) in enumerate(ends):
-        point[axis] = min(max(point[axis], borders[0]), borders[1])
-        for border in borders:
+    for i, (low, high, start, stop) in enumerate(axes):
+        point[i] = min(max(point[i], low), high)
+        for border in (low, high):
             if stop != start and (border - start) / (stop - start) == t:
-                point[axis] = border
+                point[i] = border
     return point

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -59,15 +59,16 @@ class Sighting:
     """One board in one image.
 
     Attributes:
-        seed, turn: of the scene and the board (degrees).
+        seed: number of the scene.
+        turn: yaw of the board, degrees.
         distance: along the street, metres.
-        found: its id was read.
+        found: its id was read; otherwise all errors are NaN.
+        pixels: mean side of the black square, from the true pose.
         translation: (3,) of the estimate minus truth, along the line of sight, to the right, down, metres.
-        rotation: angle between estimated and true orientation, degrees.
-        other: the same for the rejected pose.
-        pixels: mean side of the black square.
-        error: reprojection error, pixels.
-        ambiguity: ratio of the two errors.
+        rotation: angle between the orientation of the preferred pose and the true one, degrees.
+        other: that angle of the rejected pose, degrees.
+        error: reprojection error of the preferred pose, pixels.
+        ambiguity: see `SquarePose`.
     """
 
     seed: int
@@ -88,15 +89,26 @@ def measure(configs: Sequence[CurveConfig]) -> list[list[Sighting]]:
     The same configs give the same numbers. Raises UserError for an invalid config, or for configs that differ in more
     than the detector.
     """
-    found: list[list[Sighting]] = [[] for _ in configs]
+    if not configs:
+        return []
     for config in configs:
         check_settings(config, "CurveConfig.")
         if replace(config, detector=configs[0].detector) != configs[0]:
             raise UserError("detectors are compared on the same scenes: give configs that differ in the detector alone")
-    for image in _images(configs[0]) if configs else ():
+    found: list[list[Sighting]] = [[] for _ in configs]
+    for image in _images(configs[0]):
         for sightings, config in zip(found, configs, strict=True):
             sightings += _sightings(image, config.detector)
     return found
+
+
+class _Board(NamedTuple):
+    """A board in an image: ego_from_marker, turn in degrees, corners in pixels of the whole image."""
+
+    marker_id: int
+    pose: Float[np.ndarray, "4 4"]
+    turn: float
+    outline: Float[np.ndarray, "4 2"]
 
 
 @dataclass(frozen=True)
@@ -107,14 +119,14 @@ class _Image:
         pixels: (h, w, 3).
         corner: its upper left pixel in the whole image.
         camera: of the whole image.
-        boards: marker id, ego_from_marker, turn (degrees) and outline (4, 2) of each.
+        boards: those that lie wholly in it, and in no image before.
         seed, distance: as in `Sighting`.
     """
 
     pixels: UInt8[np.ndarray, "h w 3"]
     corner: tuple[int, int]
     camera: PinholeCamera
-    boards: list[tuple[int, Float[np.ndarray, "4 4"], float, Float[np.ndarray, "4 2"]]]
+    boards: list[_Board]
     seed: int
     distance: float
 
@@ -127,30 +139,35 @@ def _images(config: CurveConfig) -> Iterator[_Image]:
         assert markers is not None
         for number, distance in enumerate(config.distances):
             poses = invert_pose(log.keyframes[number].global_from_ego) @ markers.pose
-            left = np.ones(len(poses), bool)
+            unseen = np.ones(len(poses), bool)
             for view, camera in enumerate(draw_rig(log.seed, rig)):
                 outlines = np.stack(
                     [marker_outline(pose, markers.size, camera.intrinsics, camera.camera_from_ego) for pose in poses]
                 )
-                here = left & _in_image(outlines, camera)
-                left &= ~here
-                if here.any():
-                    corner, size = _window(outlines[here], camera)
-                    ids = markers.marker_id.tolist()
-                    boards = [(ids[k], poses[k], turns[k], outlines[k]) for k in np.flatnonzero(here).tolist()]
-                    pixels = render_window(log, number, rig, corner, size, camera=view)
-                    yield _Image(pixels, corner, camera, boards, seed, distance)
+                here = unseen & _in_image(outlines, camera)
+                unseen &= ~here
+                if not here.any():
+                    continue
+                boards = [
+                    _Board(int(markers.marker_id[k]), poses[k], turns[k], outlines[k])
+                    for k in np.flatnonzero(here).tolist()
+                ]
+                corner, size = _window(outlines[here], camera)
+                pixels = render_window(log, number, rig, corner, size, camera=view)
+                yield _Image(pixels, corner, camera, boards, seed, distance)
 
 
 def _sightings(image: _Image, detector: DetectorConfig) -> list[Sighting]:
-    found, answer = find_markers(image.pixels, detector), []
-    for marker_id, pose, turn, outline in image.boards:
-        sight = Sighting(image.seed, turn, image.distance, False, float(_sides(outline)))
-        hits = np.flatnonzero(found.marker_id == marker_id)
+    found = find_markers(image.pixels, detector)
+    sightings = []
+    for board in image.boards:
+        sighting = Sighting(image.seed, board.turn, image.distance, False, float(_sides(board.outline)))
+        hits = np.flatnonzero(found.marker_id == board.marker_id)
         if len(hits):
-            sight = _compared(sight, found.corners[hits[0]] + image.corner, image.camera, pose, detector)
-        answer.append(sight)
-    return answer
+            corners = found.corners[hits[0]] + image.corner
+            sighting = _compared(sighting, corners, image.camera, board.pose, detector)
+        sightings.append(sighting)
+    return sightings
 
 
 def _sides(outline: Float[np.ndarray, "*b 4 2"]) -> Float[np.ndarray, "*b"]:

@@ -107,31 +107,42 @@ def find_markers(
             cells = marker_cells(config.family, marker_id)
             if config.corners == "pattern":
                 corners = refine_corners(grey, corners, cells)
-            found.append(_Reading(marker_id, _fit(cv2, grey, corners, cells), corners))
+            found.append(_Reading(marker_id, _rank(cv2, grey, corners, cells), corners))
     if config.search == "all":
         for each in find_occluded(grey, config.family, config.least_pixels * config.enlarge, config.ids):
-            cells = marker_cells(config.family, each.marker_id)
-            found.append(
-                _Reading(each.marker_id, (each.wrong_bits, _fit(cv2, grey, each.corners, cells)[1]), each.corners)
-            )
+            rank = _rank(cv2, grey, each.corners, marker_cells(config.family, each.marker_id))
+            # Its own count of wrong cells stands, which knows shadows.
+            found.append(_Reading(each.marker_id, rank._replace(wrong_bits=each.wrong_bits), each.corners))
     return _as_arrays(_best_ids(_one_for_each_place(found)), config.enlarge)
 
 
 def joined(parts: Sequence[ImageMarkers]) -> ImageMarkers:
     """Return what was found in several parts of one image, in pixels of the whole image, as `find_markers` does."""
     found = [
-        _Reading(int(marker_id), (int(wrong), 0.0), corners)
+        _Reading(int(marker_id), _Rank(int(wrong), 0.0), corners)
         for part in parts
         for marker_id, corners, wrong in zip(part.marker_id, part.corners, part.wrong_bits, strict=True)
     ]
     return _as_arrays(_best_ids(_one_for_each_place(found)))
 
 
+class _Rank(NamedTuple):
+    """How badly the cells at a place read as those of a marker; the smaller rank is the better reading.
+
+    Attributes:
+        wrong_bits: cells read with the wrong colour.
+        black_minus_white: brightness, -255 (full contrast) to 255.
+    """
+
+    wrong_bits: int
+    black_minus_white: float
+
+
 class _Reading(NamedTuple):
-    """A marker read in an outline; `rank` is that of `_fit`."""
+    """A marker read at a place; of two readings there, that of the smaller rank counts."""
 
     marker_id: int
-    rank: tuple[int, float]
+    rank: _Rank
     corners: Float[np.ndarray, "4 2"]
 
 
@@ -139,7 +150,7 @@ def _as_arrays(readings: list[_Reading], enlarged: int = 1) -> ImageMarkers:
     return ImageMarkers(
         np.array([each.marker_id for each in readings], int),
         np.array([each.corners for each in readings]).reshape(-1, 4, 2) / enlarged,
-        np.array([each.rank[0] for each in readings], int),
+        np.array([each.rank.wrong_bits for each in readings], int),
     )
 
 
@@ -161,7 +172,9 @@ def _best_ids(found: list[_Reading]) -> list[_Reading]:
     return [
         each
         for each in found
-        if not any(other.rank[0] < each.rank[0] and _overlap(each.corners, other.corners) for other in found)
+        if not any(
+            other.rank.wrong_bits < each.rank.wrong_bits and _overlap(each.corners, other.corners) for other in found
+        )
     ]
 
 
@@ -180,12 +193,10 @@ def _detector(cv2: Any, longest: int, config: DetectorConfig, window: int) -> An
     return cv2.aruco.ArucoDetector(dictionary_of(config.family), parameters)
 
 
-def _fit(
+def _rank(
     cv2: Any, grey: UInt8[np.ndarray, "h w"], corners: Float[np.ndarray, "4 2"], cells: Bool[np.ndarray, "n n"]
-) -> tuple[int, float]:
-    """Return the number of cells read with the wrong colour, and black minus white brightness (-255 to 255).
-
-    Lower is better for both."""
+) -> _Rank:
+    """Return how badly the cells in an outline read as those of a marker."""
     across, fine = len(cells), 8
     square = fine * across * np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)]) - 0.5
     flat = cv2.getPerspectiveTransform((corners - 0.5).astype(np.float32), square.astype(np.float32))
@@ -193,4 +204,4 @@ def _fit(
     # Only the middle of each cell: its edge is blurred with its neighbours.
     middle = seen.reshape(across, fine, across, fine)[:, 2:6, :, 2:6].mean((1, 3))
     white, black = middle[cells].mean(), middle[~cells].mean()
-    return int(((middle > 0.5 * (white + black)) != cells).sum()), float(black - white)
+    return _Rank(int(((middle > 0.5 * (white + black)) != cells).sum()), float(black - white))

@@ -102,37 +102,56 @@ def _pairs(found: _Segments, first: np.ndarray, least: float, most: float) -> tu
     return i[fits], j[fits]
 
 
+class _Edge(NamedTuple):
+    """One segment of each pair, measured along the common direction of the pair.
+
+    Attributes:
+        middle: (q, 2) of the segment, pixels.
+        along: (q, 2) its unit direction, turned to the common one.
+        place: (q,) of the middle along the common direction, pixels.
+        half: (q,) half its length, pixels.
+    """
+
+    middle: Float[np.ndarray, "q 2"]
+    along: Float[np.ndarray, "q 2"]
+    place: Float[np.ndarray, " q"]
+    half: Float[np.ndarray, " q"]
+
+    def ends(self) -> tuple[Float[np.ndarray, " q"], Float[np.ndarray, " q"]]:
+        """Return the places of both ends."""
+        return self.place - self.half, self.place + self.half
+
+    def at(self, place: Float[np.ndarray, " q"]) -> Float[np.ndarray, "q 2"]:
+        """Return the points at places on the edge, or on its prolongation."""
+        return self.middle + (place - self.place)[:, None] * self.along
+
+
+def _edge(
+    found: _Segments, rows: np.ndarray, along: Float[np.ndarray, "q 2"], origin: Float[np.ndarray, "q 2"]
+) -> _Edge:
+    turned = found.along[rows] * np.sign((found.along[rows] * along).sum(-1))[:, None]
+    place = ((found.middle[rows] - origin) * along).sum(-1)
+    return _Edge(found.middle[rows], turned, place, 0.5 * found.length[rows])
+
+
 def _of_pairs(found: _Segments, i: np.ndarray, j: np.ndarray) -> Float[np.ndarray, "q 4 2"]:
-    """Return the quads of pairs of segments, corners clockwise in the image."""
-    along = found.along[i] - np.sign((found.along[i] * found.along[j]).sum(-1))[:, None] * -found.along[j]
+    """Return the quads of pairs of segments, corners clockwise in the image.
+
+    A pair gives several quads: from the ends of both segments, of one of them, or of their union, also prolonged.
+    """
+    same_way = np.sign((found.along[i] * found.along[j]).sum(-1))[:, None]
+    along = found.along[i] + same_way * found.along[j]
     along /= np.linalg.norm(along, axis=-1, keepdims=True)
     origin = 0.5 * (found.middle[i] + found.middle[j])
-    lines = []
-    for k in (i, j):
-        slope = found.along[k] * np.sign((found.along[k] * along).sum(-1))[:, None]
-        middle = ((found.middle[k] - origin) * along).sum(-1)
-        lines.append((found.middle[k], slope, middle, 0.5 * found.length[k]))
-    (a, a_slope, a_mid, a_half), (b, b_slope, b_mid, b_half) = lines
-    ends_a, ends_b = (np.stack([mid - half, mid + half], -1) for mid, half in ((a_mid, a_half), (b_mid, b_half)))
-    low, high = np.minimum(ends_a[:, 0], ends_b[:, 0]), np.maximum(ends_a[:, 1], ends_b[:, 1])
-    whole = high - low
-    choices = [(ends_a, ends_b), (ends_a, ends_a), (ends_b, ends_b), (np.stack([low, high], -1),) * 2]
+    a, b = _edge(found, i, along, origin), _edge(found, j, along, origin)
+    low, high = np.minimum(a.ends()[0], b.ends()[0]), np.maximum(a.ends()[1], b.ends()[1])
+    union, length = (low, high), high - low
+    # The places of the corners on a, and those on b.
+    choices = [(a.ends(), b.ends()), (a.ends(), a.ends()), (b.ends(), b.ends()), (union, union)]
     for more in _LONGER:
-        choices.append((np.stack([low - more * whole, high], -1),) * 2)
-        choices.append((np.stack([low, high + more * whole], -1),) * 2)
-    quads = []
-    for on_a, on_b in choices:
-        corners = [
-            place + (t - middle)[:, None] * slope
-            for place, slope, middle, t in (
-                (a, a_slope, a_mid, on_a[:, 0]),
-                (a, a_slope, a_mid, on_a[:, 1]),
-                (b, b_slope, b_mid, on_b[:, 1]),
-                (b, b_slope, b_mid, on_b[:, 0]),
-            )
-        ]
-        quads.append(np.stack(corners, 1))
-    every = np.concatenate(quads)
+        before, behind = (low - more * length, high), (low, high + more * length)
+        choices += [(before, before), (behind, behind)]
+    every = np.concatenate([np.stack([a.at(a0), a.at(a1), b.at(b1), b.at(b0)], 1) for (a0, a1), (b0, b1) in choices])
     one, two = every[:, 1] - every[:, 0], every[:, 3] - every[:, 0]
     turn = one[:, 0] * two[:, 1] - one[:, 1] * two[:, 0]
     return np.where((turn > 0.0)[:, None, None], every, every[:, ::-1])

@@ -25,14 +25,13 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from tflane_jax.files.images import opencv
+from tflane_jax.markers.cell_levels import LEAST_QUALITY, CellLevels, cell_levels, splits
 from tflane_jax.markers.corner_refinement import refine_corners
-from tflane_jax.markers.occluded_quads import BLACK, CONTRAST, WHITE, rings, square_quads
+from tflane_jax.markers.occluded_quads import CONTRAST, rings, square_quads
 from tflane_jax.scene.marker_patterns import MarkerFamily, cells_across, marker_cells, marker_count
 
-# Least fraction of margin and border cells that read as such.
-_READ = 0.55
-# Bits by which an id must be ahead of chance, where `_READ` and where `_SURE` of margin and border read as such, and
-# of the second best id; cost of a cell that reads wrong, bits.
+# Bits by which an id must be ahead of chance, where `LEAST_QUALITY` of margin and border read as such and where `_SURE`
+# of them do, and of the second best id; cost of a cell that reads wrong, bits.
 _SURE, _AHEAD, _SECOND, _WRONG = 0.8, (9.0, 4.0), 4.0, 4.0
 # Least fraction of a board's points that are as bright as printed; less is enough (dirt) if nearly all cells of margin
 # and border, and all inner ones but a few, read right.
@@ -102,29 +101,29 @@ def _identify(
     for _ in range(2):
         shaded = None if levels is None else levels.shaded
         corners = refine_corners(grey, corners, np.zeros((n, n), bool), ring, shaded)
-        levels = _levelled(_cell_means(grey, corners, n))
+        levels = cell_levels(_cell_means(grey, corners, n))
         if levels is None or not levels.shaded.any():
             break
-    read = None if levels is None else _read(levels, family, ids)
-    if read is None:
+    decoded = None if levels is None else _decoded(levels, family, ids)
+    if decoded is None:
         return None
     # Once more with the printed cells, whose edges fix the corners where the outline is hidden.
-    cells, tried = marker_cells(family, read.marker_id), []
-    for start in (np.roll(corners, -read.turns, 0), np.roll(quad, -read.turns, 0)):
+    cells, tried = marker_cells(family, decoded.marker_id), []
+    for start in (np.roll(corners, -decoded.turns, 0), np.roll(quad, -decoded.turns, 0)):
         for shaded in (None, _best_shade(grey, start, cells)):
             final = refine_corners(grey, start, cells, None, shaded)
             tried.append((_explained(grey, final, cells, _best_shade(grey, final, cells)), final))
     explained, final = max(tried, key=lambda pair: pair[0])
-    levels = _levelled(_cell_means(grey, final, n))
-    again = None if levels is None else _read(levels, family, ids)
-    if levels is None or again is None or (again.marker_id, again.turns) != (read.marker_id, 0):
+    levels = cell_levels(_cell_means(grey, final, n))
+    again = None if levels is None else _decoded(levels, family, ids)
+    if levels is None or again is None or (again.marker_id, again.turns) != (decoded.marker_id, 0):
         return None
     dirty = explained >= _DIRTY and levels.quality >= _CLEAN and again.wrong <= _FEW
     certain = explained >= _EXPLAINED or dirty
     if not certain or _inner_explained(grey, final, cells, levels) < _INNER:
         return None
-    of_border = int((rings(n + 2)[1] & (levels.read >= 0.0)).sum())
-    return OccludedMarker(read.marker_id, final, again.wrong + of_border, explained)
+    of_border = int((rings(n + 2)[1] & (levels.colours >= 0.0)).sum())
+    return OccludedMarker(decoded.marker_id, final, again.wrong + of_border, explained)
 
 
 def _inside(point: Float[np.ndarray, "2"], corners: Float[np.ndarray, "4 2"]) -> bool:
@@ -136,7 +135,7 @@ def _inside(point: Float[np.ndarray, "2"], corners: Float[np.ndarray, "4 2"]) ->
 # Cells
 
 
-class _Read(NamedTuple):
+class _Decoded(NamedTuple):
     """An id, the quarter turns of its pattern in the quad, and how many inner cells do not read as printed."""
 
     marker_id: int
@@ -144,21 +143,21 @@ class _Read(NamedTuple):
     wrong: int
 
 
-def _read(levels: _Levels, family: MarkerFamily, ids: tuple[int, ...]) -> _Read | None:
+def _decoded(levels: CellLevels, family: MarkerFamily, ids: tuple[int, ...]) -> _Decoded | None:
     """Return the id of the cells in a quad; None if none is certain."""
-    read, quality = levels.read, levels.quality
+    colours, quality = levels.colours, levels.quality
     codes, names, turns = _codes(family, ids)
-    doubt = np.clip((_SURE - quality) / (_SURE - _READ), 0.0, 1.0)
+    doubt = np.clip((_SURE - quality) / (_SURE - LEAST_QUALITY), 0.0, 1.0)
     needed = np.log2(len(codes)) + _AHEAD[1] + doubt * (_AHEAD[0] - _AHEAD[1])
-    for hidden in (np.zeros_like(read, bool), _between_faults(read)):
-        inner = np.where(hidden, 0.0, read)[2:-2, 2:-2].ravel()
+    for hidden in (np.zeros_like(colours, bool), _between_faults(colours)):
+        inner = np.where(hidden, 0.0, colours)[2:-2, 2:-2].ravel()
         # A bit for each cell that reads as printed, minus the cost of each that reads the other way.
         agree = np.maximum(codes * inner, 0.0).sum(-1)
         evidence = agree - _WRONG * np.maximum(-codes * inner, 0.0).sum(-1)
         best = int(np.argmax(evidence))
         second = evidence[names != names[best]].max(initial=-np.inf)
         if evidence[best] >= needed and evidence[best] >= second + _SECOND:
-            return _Read(int(names[best]), int(turns[best]), int(len(inner) - agree[best]))
+            return _Decoded(int(names[best]), int(turns[best]), int(len(inner) - agree[best]))
     return None
 
 
@@ -203,9 +202,9 @@ def _best_shade(
     """Return the cells on one side of the shadow edge with which the printed cells explain most of the image."""
     m = len(cells) + 2
     shades = [np.zeros((m, m), bool)]
-    for sides in _splits(m)[1:]:
+    for sides in splits(m)[1:]:
         shade = np.zeros(m * m, bool)
-        shade[sides[0][0]] = True
+        shade[sides[0].cells] = True
         shades.append(shade.reshape(m, m))
     seen, board = _fine(grey, corners, cells, 3)
     explained = [_fraction_explained(seen, board, shade) for shade in shades]
@@ -225,11 +224,14 @@ def _explained(
 
 
 def _inner_explained(
-    grey: UInt8[np.ndarray, "h w"], corners: Float[np.ndarray, "4 2"], cells: Bool[np.ndarray, "n n"], levels: _Levels
+    grey: UInt8[np.ndarray, "h w"],
+    corners: Float[np.ndarray, "4 2"],
+    cells: Bool[np.ndarray, "n n"],
+    levels: CellLevels,
 ) -> float:
     """Return the fraction of the points of inner cells in sight, or else of all, that are as bright as printed."""
     right = _as_printed(*_fine(grey, corners, cells, 6), _best_shade(grey, corners, cells))[12:-12, 12:-12]
-    sight = np.kron(~_between_faults(levels.read)[2:-2, 2:-2], np.ones((6, 6), bool))
+    sight = np.kron(~_between_faults(levels.colours)[2:-2, 2:-2], np.ones((6, 6), bool))
     return float(right[sight].mean() if sight.any() else right.mean())
 
 
@@ -263,74 +265,6 @@ def _as_printed(
             return np.zeros(seen.shape, bool)
         right |= side & (np.abs(seen - (black + (white - black) * board)) < 0.2 * (white - black))
     return right
-
-
-class _Levels(NamedTuple):
-    """Cells of a quad, the margin included.
-
-    Attributes:
-        read: 1 for white cells, -1 for black and 0 for unknown ones.
-        quality: fraction of margin and border that reads as such.
-        shaded: cells in a shadow.
-    """
-
-    read: Float[np.ndarray, "m m"]
-    quality: float
-    shaded: Bool[np.ndarray, "m m"]
-
-
-def _levelled(seen: Float[np.ndarray, "m m"]) -> _Levels | None:
-    """Return the colours of cells; None if margin and border do not read as white and black.
-
-    Levels of white and black are medians over margin and border; with a shadow edge, on each of its sides.
-    """
-    flat, m = seen.ravel(), len(seen)
-    margin, border = (ring.ravel() for ring in rings(m))
-    best, chosen, shaded = -1.0, None, np.zeros(m * m, bool)
-    for sides in _splits(m):
-        read, levels = np.zeros(m * m), []
-        for side, whites, blacks in sides:
-            white, black = np.sort(flat[whites])[len(whites) // 2], np.sort(flat[blacks])[len(blacks) // 2]
-            if white - black < CONTRAST:
-                break
-            levels.append(white)
-            fraction = (flat[side] - black) / (white - black)
-            bright, dark = (fraction > WHITE[0]) & (fraction < WHITE[1]), (fraction > BLACK[0]) & (fraction < BLACK[1])
-            read[side] = bright * 1.0 - dark * 1.0
-        else:
-            right = np.count_nonzero(read[margin] > 0.0) + np.count_nonzero(read[border] < 0.0)
-            # A shadow edge must explain more than one that is not there.
-            quality = right / (np.count_nonzero(margin) + np.count_nonzero(border)) - 0.06 * (len(sides) - 1)
-            if quality > best:
-                best, chosen, shaded = quality, read, np.zeros(m * m, bool)
-                if len(sides) > 1:
-                    shaded[sides[int(np.argmin(levels))][0]] = True
-            if len(sides) == 1 and quality > 0.93:
-                break
-    return None if chosen is None or best < _READ else _Levels(chosen.reshape(m, m), best, shaded.reshape(m, m))
-
-
-_Side = tuple[np.ndarray, np.ndarray, np.ndarray]
-
-
-@lru_cache(maxsize=8)
-def _splits(m: int) -> tuple[tuple[_Side, ...], ...]:
-    """Return the whole board, then both sides of straight edges across it: their cells, margin cells, border cells."""
-    at = (np.arange(m) + 0.5) / m - 0.5
-    y, x = (axis.ravel() for axis in np.meshgrid(at, at, indexing="ij"))
-    margin, border = (ring.ravel() for ring in rings(m))
-
-    def part(side: np.ndarray) -> _Side:
-        return np.flatnonzero(side), np.flatnonzero(side & margin), np.flatnonzero(side & border)
-
-    found: list[tuple[_Side, ...]] = [(part(np.ones(m * m, bool)),)]
-    for angle in np.arange(8) * np.pi / 8:
-        for offset in (-0.3, -0.2, -0.1, 0.0, 0.1, 0.2, 0.3):
-            side = x * np.cos(angle) + y * np.sin(angle) > offset
-            both = part(side), part(~side)
-            if all(len(whites) >= 4 and len(blacks) >= 3 for _, whites, blacks in both):
-                found.append(both)
-    return tuple(found)
 
 
 @lru_cache(maxsize=32)

@@ -17,7 +17,7 @@ from tflane_jax.geometry import pose_matrix, pose_yaw, relative_pose, transform_
 from tflane_jax.limits import ASCENDING, Count, Fraction, Positive, PositiveOrZero, counted, within
 from tflane_jax.markers.observe import frame_before
 from tflane_jax.markers.pixels import PixelConfig
-from tflane_jax.markers.visibility import in_images, seen_fraction
+from tflane_jax.markers.visibility import fraction_in_sight, in_images, seen_fraction
 from tflane_jax.scene.logs import KeyFrame, Log, PlacedMarkers
 from tflane_jax.world.bev.line_of_sight import hidden_points
 from tflane_jax.world.cameras.ring import ARGOVERSE2_RING, CameraMount
@@ -150,18 +150,22 @@ def simulate_detections(
 
     Args:
         log, moment, markers, config: see above.
-        cameras: calibrated cameras of a real frame, one of which must see the whole square; None: `config.cameras`.
+        cameras: calibrated cameras of a real frame, one of which must see the whole square, besides those of `config`;
+            None: no such cameras.
     """
     true = relative_pose(moment.global_from_ego, markers.pose)
     seen = visible(true, config)
     if cameras is not None:
         seen[seen] = in_images(true[seen], markers.size, cameras)
-    if config.cameras is not None or config.occlusion == "bodies":
-        mounts = config.cameras or ARGOVERSE2_RING
-        bodies = static_boxes(log) if config.occlusion == "bodies" else None
-        shown = seen_fraction(log, moment, true[seen], markers.size, mounts, bodies, framed=config.cameras is not None)
-        # A square outside all images is not seen, whatever fraction is enough.
-        seen[seen] = (shown > 0.0) & (shown >= (config.least_seen if config.occlusion == "bodies" else 1.0))
+    if config.occlusion == "bodies":
+        fraction, mounts = seen_fraction, config.cameras
+        if mounts is None:
+            fraction, mounts = fraction_in_sight, ARGOVERSE2_RING
+        shown = fraction(log, moment, true[seen], markers.size, mounts, static_boxes(log))
+        # A square outside all images is not seen, even where `least_seen` is 0.
+        seen[seen] = (shown > 0.0) & (shown >= config.least_seen)
+    elif config.cameras is not None:
+        seen[seen] = seen_fraction(log, moment, true[seen], markers.size, config.cameras, None) > 0.0
     if config.occlusion == "line_of_sight":
         seen[seen] = ~_hidden(log, moment, true[seen])
     count = len(seen)

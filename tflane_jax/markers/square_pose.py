@@ -64,7 +64,8 @@ def solve_square(
     # marker mirrored, where the rotation is small; z does not matter for a flat square. A marker on its side or head
     # is solved as the upright one that looks the same, and turned back.
     seen = rays[:, :2] / rays[:, 2:] * [1.0, -1.0]
-    quarters = int(np.argmax([upper.mean(0)[1] for upper in (seen[[k, (k + 1) % 4]] for k in range(4))]))
+    height_of_side = [seen[[k, (k + 1) % 4]].mean(0)[1] for k in range(4)]
+    quarters = int(np.argmax(height_of_side))
     seen = np.roll(seen, -quarters, axis=0)
     count, turns, places = _two_poses(cv2, square, seen)
     if not np.isfinite(turns).all():
@@ -81,8 +82,11 @@ def solve_square(
     error = np.sqrt(((pixels - corners) ** 2).sum(-1).mean(-1))
     order = np.argsort(error, kind="stable")
     fit = SquarePose(poses[order], error[order])
-    if fit.ambiguity <= config.ambiguous:
-        return fit
+    return fit if fit.ambiguity <= config.ambiguous else _by_prior(fit, camera_from_ego, config)
+
+
+def _by_prior(fit: SquarePose, camera_from_ego: Float[np.ndarray, "4 4"], config: DetectorConfig) -> SquarePose:
+    """Return both poses, that of the smaller cost by the prior first (see `solve_square`)."""
     up = np.asarray(camera_from_ego, np.float64)[:3, 2]
     toward = -fit.camera_from_marker[:, :3, 3]
     toward /= np.linalg.norm(toward, axis=-1, keepdims=True)

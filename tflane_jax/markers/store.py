@@ -10,6 +10,7 @@ import datetime
 import warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -153,36 +154,49 @@ def store_of(
         surveyed, expires: written to all entries.
         source: origin of the lanes, for messages.
     """
-    return MarkerStore(
-        {
-            int(number): StoredMarker(
-                int(number), pose, *_local_graph(lanes, pose, radius, points), markers.size, surveyed, expires
-            )
-            for number, pose in zip(markers.marker_id, markers.pose, strict=True)
-        },
-        source,
-    )
+    entries = {}
+    for number, pose in zip(markers.marker_id, markers.pose, strict=True):
+        local, successor = _local_graph(lanes, pose, radius, points)
+        entries[int(number)] = StoredMarker(int(number), pose, local, successor, markers.size, surveyed, expires)
+    return MarkerStore(entries, source)
+
+
+class _Piece(NamedTuple):
+    """A piece of a lane inside the circle around a marker.
+
+    Attributes:
+        lane: id of its lane.
+        points: (n, 3) global metres.
+        starts, ends: whether it contains the start, and the end, of its lane.
+    """
+
+    lane: int
+    points: Float[np.ndarray, "n 3"]
+    starts: bool
+    ends: bool
 
 
 def _local_graph(
     lanes: Mapping[int, LaneSegment], pose: Float[np.ndarray, "4 4"], radius: float, points: int
 ) -> tuple[Float[np.ndarray, "j p 3"], Bool[np.ndarray, "j j"]]:
-    center, pieces = pose[:2, 3], []
+    """Return the pieces of the lanes around a marker, in its frame, and which of them follow which."""
+    center = pose[:2, 3]
+    pieces: list[_Piece] = []
     for number, lane in lanes.items():
-        low, high = lane.centerline[:, :2].min(0), lane.centerline[:, :2].max(0)
-        if (low <= center + radius).all() and (high >= center - radius).all():
-            parts = _clip_to_circle(lane.centerline, center, radius)
-            pieces += [(number, part, i == 0, i == len(parts) - 1) for i, part in enumerate(parts)]
-    whole = [lanes[number].centerline for number, *_ in pieces]
-    ends = np.array(
-        [last and np.array_equal(p[-1], line[-1]) for (_, p, _, last), line in zip(pieces, whole, strict=True)], bool
-    )
-    starts = np.array(
-        [first and np.array_equal(p[0], line[0]) for (_, p, first, _), line in zip(pieces, whole, strict=True)], bool
-    )
-    follows = np.array([[b in lanes[a].successors for b, *_ in pieces] for a, *_ in pieces], bool)
+        line = lane.centerline
+        low, high = line[:, :2].min(0), line[:, :2].max(0)
+        if not ((low <= center + radius).all() and (high >= center - radius).all()):
+            continue
+        parts = _clip_to_circle(line, center, radius)
+        for i, part in enumerate(parts):
+            starts = i == 0 and np.array_equal(part[0], line[0])
+            ends = i == len(parts) - 1 and np.array_equal(part[-1], line[-1])
+            pieces.append(_Piece(number, part, starts, ends))
+    follows = np.array([[b.lane in lanes[a.lane].successors for b in pieces] for a in pieces], bool)
+    starts = np.array([piece.starts for piece in pieces], bool)
+    ends = np.array([piece.ends for piece in pieces], bool)
     joined = follows.reshape(len(pieces), len(pieces)) & ends[:, None] & starts
-    lines = resample_lines([p for _, p, *_ in pieces], points)
+    lines = resample_lines([piece.points for piece in pieces], points)
     return transform_points(invert_pose(pose), lines.reshape(-1, 3)).reshape(lines.shape), joined
 
 

@@ -28,10 +28,8 @@ def seen_fraction(
     size: float,
     mounts: Sequence[CameraMount],
     bodies: Float[np.ndarray, "b 7"] | None,
-    *,
-    framed: bool = True,
 ) -> Float[np.ndarray, " m"]:
-    """Return the largest fraction of each square that one of the cameras sees; 0 outside all images.
+    """Return the largest fraction of each square that one of the cameras sees; 0 if no image has the whole square.
 
     Args:
         log, moment: scene, whose road users hide boards too.
@@ -39,21 +37,45 @@ def seen_fraction(
         size: side of the black square, metres.
         mounts: cameras, with the calibration that the log has.
         bodies: static boxes as `Bodies.boxes`, global frame; None: nothing hides a board.
-        framed: a board must lie in an image as a whole; False: all boards are looked at from the first camera's place.
     """
-    cameras = draw_rig(log.seed, CameraRigConfig(cameras=tuple(mounts), scale=1.0))
-    best = np.zeros(len(ego_from_marker))
     boxes = None if bodies is None else _boxes_around(log, moment, bodies)
     points = transform_points(ego_from_marker[:, None], size * _POINTS)
-    for camera in cameras if framed else cameras[:1]:
-        rows = np.flatnonzero(in_image(ego_from_marker, size, camera)) if framed else np.arange(len(best))
-        shown = np.ones(len(rows))
-        if boxes is not None and len(rows):
-            eye = invert_pose(camera.camera_from_ego)[:3, 3]
-            hidden = hidden_from(eye, points[rows].reshape(-1, 3), boxes)
-            shown = 1.0 - hidden.reshape(len(rows), -1).mean(-1)
-        best[rows] = np.maximum(best[rows], shown)
+    best = np.zeros(len(ego_from_marker))
+    for camera in _cameras(log, mounts):
+        rows = np.flatnonzero(in_image(ego_from_marker, size, camera))
+        best[rows] = np.maximum(best[rows], _in_sight(camera, points[rows], boxes))
     return best
+
+
+def fraction_in_sight(
+    log: Log,
+    moment: KeyFrame,
+    ego_from_marker: Float[np.ndarray, "m 4 4"],
+    size: float,
+    mounts: Sequence[CameraMount],
+    bodies: Float[np.ndarray, "b 7"],
+) -> Float[np.ndarray, " m"]:
+    """Return the fraction of each square that nothing hides from the first camera's place, wherever it looks.
+
+    Arguments are those of `seen_fraction`.
+    """
+    points = transform_points(ego_from_marker[:, None], size * _POINTS)
+    return _in_sight(_cameras(log, mounts)[0], points, _boxes_around(log, moment, bodies))
+
+
+def _cameras(log: Log, mounts: Sequence[CameraMount]) -> tuple[PinholeCamera, ...]:
+    return tuple(draw_rig(log.seed, CameraRigConfig(cameras=tuple(mounts), scale=1.0)))
+
+
+def _in_sight(
+    camera: PinholeCamera, points: Float[np.ndarray, "m p 3"], boxes: Float[np.ndarray, "b 7"] | None
+) -> Float[np.ndarray, " m"]:
+    """Return the fraction of each square's points that no box hides from a camera."""
+    if boxes is None or not len(points):
+        return np.ones(len(points))
+    eye = invert_pose(camera.camera_from_ego)[:3, 3]
+    hidden = hidden_from(eye, points.reshape(-1, 3), boxes)
+    return 1.0 - hidden.reshape(len(points), -1).mean(-1)
 
 
 def in_image(ego_from_marker: Float[np.ndarray, "m 4 4"], size: float, camera: PinholeCamera) -> Bool[np.ndarray, " m"]:

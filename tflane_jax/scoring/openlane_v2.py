@@ -18,7 +18,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from tflane_jax.errors import UserError
-from tflane_jax.files.fields import choices, fractions, items, load_file, member, scores
+from tflane_jax.files.fields import fractions, items, load_file, member, scores, truth_values
 from tflane_jax.files.folders import named_folder
 from tflane_jax.files.openlane import (
     CENTERLINE,
@@ -146,7 +146,7 @@ def _truth(record: Any, where: str, names: FieldNames) -> LaneTruth:
     boxes, attributes = _elements(record, where)
     _check_ids(record, (names.lanes, "traffic_element"), where)
     lane_lane, lane_element = (
-        choices(member(record, field, where), (len(points), count), f"{where}: {field}")
+        truth_values(member(record, field, where), (len(points), count), f"{where}: {field}")
         for field, count in ((names.lane_lane, len(points)), (names.lane_element, len(boxes)))
     )
     if names is CENTERLINE:  # those of segments are resampled

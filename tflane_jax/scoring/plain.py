@@ -19,7 +19,17 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tflane_jax.errors import UserError
-from tflane_jax.files.fields import choices, fractions, is_name, is_time, items, line_points, load_file, member, scores
+from tflane_jax.files.fields import (
+    fractions,
+    is_name,
+    is_time,
+    items,
+    line_points,
+    load_file,
+    member,
+    scores,
+    truth_values,
+)
 from tflane_jax.files.npz import read_npz
 from tflane_jax.files.wording import named, shown
 from tflane_jax.metrics.frames import LaneDetections, LaneTruth
@@ -52,7 +62,7 @@ def read_truth(path: Path) -> dict[PlainKey, LaneTruth]:
         if "scores" in record:
             raise UserError(f"{where} has scores, so that {path} is a file of predictions: give the ground truth")
         lanes = _lines(record, where, least=2)
-        successor = choices(member(record, "successor", where), (len(lanes), len(lanes)), f"{where}: successor")
+        successor = truth_values(member(record, "successor", where), (len(lanes), len(lanes)), f"{where}: successor")
         visibility = _column(record, "visibility", where) if "visibility" in record else None
         frames[key] = LaneTruth(lanes, successor, visibility=visibility)
     return frames
@@ -97,9 +107,9 @@ def _npz_records(path: Path) -> Iterator[dict[str, Any]]:
     for name, shape in shapes.items():
         if name in arrays and arrays[name].shape != shape:
             raise UserError(f"{path}: {name} has shape {arrays[name].shape}, expected {shape}")
-    valid = choices(arrays.pop("valid", np.ones((frames, lanes), bool)), (frames, lanes), f"{path}: valid")
+    valid = truth_values(arrays.pop("valid", np.ones((frames, lanes), bool)), (frames, lanes), f"{path}: valid")
     if "category" in arrays:
-        valid &= ~choices(arrays.pop("category"), (frames, lanes), f"{path}: category")
+        valid &= ~truth_values(arrays.pop("category"), (frames, lanes), f"{path}: category")
     known = {name: array for name, array in arrays.items() if name in (*shapes, "points")}
     for f in range(frames):
         record: dict[str, Any] = {name: array[f] for name, array in known.items()}
@@ -119,9 +129,9 @@ def _json_records(path: Path) -> Iterator[Any]:
             yield record
             continue
         count = len(items(record, "points", at))
-        kept = choices(record.get("valid", np.ones(count, bool)), (count,), f"{at}: valid")
+        kept = truth_values(record.get("valid", np.ones(count, bool)), (count,), f"{at}: valid")
         if "category" in given:
-            kept &= ~choices(record["category"], (count,), f"{at}: category")
+            kept &= ~truth_values(record["category"], (count,), f"{at}: category")
         rows = np.flatnonzero(kept).tolist()
         lists = {name: items(record, name, at) for name in record.keys() & {"points", "scores", "visibility"}}
         for name, values in lists.items():

@@ -34,35 +34,41 @@ def excerpt(
 ) -> Traffic:
     """Return consecutive frames of a drive, while the vehicle is on its route.
 
-    A random frame on a connector is placed between 20 % before the first key frame and 20 % after the end, in units of
-    the time between the two. Of a drive without such a frame, the first part is returned.
+    A random frame on a connector becomes frame `history + u (frames - history)` of the result, with u drawn from
+    `_CROSSES`: 0 is the first key frame, 1 the end. A drive without such a frame is shown from its start.
 
     Args:
         rng: stream.
         lanes: that vehicles drive; a map may have connectors at access roads, too, up to the border of the roads.
         traffic: the whole drive, of at least `frames` frames.
-        frames, history: wanted, and those of them that come before the first key frame.
+        frames: of the result.
+        history: frames of the result before its first key frame.
         rate_hz: frames a second.
     """
-    spare = max(min(len(traffic.ego), traffic.on_route) - frames, 0)
-    crossing = np.flatnonzero(on_connector(lanes, traffic.ego[: spare + frames, :2]))
+    last_start = max(min(len(traffic.ego), traffic.on_route) - frames, 0)
+    crossing = np.flatnonzero(on_connector(lanes, traffic.ego[: last_start + frames, :2]))
     crossing = crossing[crossing >= history]
     start = 0
     if len(crossing):
         before = history + round(rng.uniform(*_CROSSES) * (frames - history))
-        start = min(max(int(rng.choice(crossing)) - before, 0), spare)
+        start = min(max(int(rng.choice(crossing)) - before, 0), last_start)
+
+    def still_shown(count: int) -> int:
+        """Return how many of the drive's first `count` frames are shown."""
+        return min(max(count - start, 0), frames)
+
     shown = slice(start, start + frames)
     seen = traffic.present[shown].any(0)
     return Traffic(
-        traffic.xy[shown, seen],
-        traffic.yaw[shown, seen],
-        traffic.present[shown, seen],
-        traffic.size[seen],
-        traffic.category[seen],
-        traffic.ego[shown],
-        min(max(traffic.on_route - start, 0), frames),
-        replace(traffic.signals, offset=traffic.signals.offset + start / rate_hz),
-        min(max(traffic.on_roads - start, 0), frames),
+        xy=traffic.xy[shown, seen],
+        yaw=traffic.yaw[shown, seen],
+        present=traffic.present[shown, seen],
+        size=traffic.size[seen],
+        category=traffic.category[seen],
+        ego=traffic.ego[shown],
+        on_route=still_shown(traffic.on_route),
+        signals=replace(traffic.signals, offset=traffic.signals.offset + start / rate_hz),
+        on_roads=still_shown(traffic.on_roads),
     )
 
 

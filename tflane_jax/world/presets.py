@@ -42,7 +42,7 @@ CITY = WorldConfig(
     duration_s=16.1,
     keyframes=4,
 )
-"""The kinds of roads and junctions of the default world."""
+"""Roads and junctions of the default world (`WorldConfig()`), with traffic, tracker and history as above."""
 
 STREET = replace(
     CITY,

@@ -116,10 +116,13 @@ class Place:
     sees: float
 
 
-def _chosen_by_sight(
+def _sight_test(
     vector_map: VectorMap, scene_id: int, config: WorldConfig, warp: Warp | None, mirror: bool
 ) -> Visible | None:
-    """Return the visibility test by which boards are placed, on the map as it is shown, which determines the trees."""
+    """Return how well drivers see a board at a place, for boards placed by that (site "clear"); None for other sites.
+
+    It is judged on the map as shown, bent and mirrored, because that determines the trees.
+    """
     if config.markers.site != "clear":
         return None
     shown = vector_map if warp is None else warped_map(vector_map, warp)
@@ -162,9 +165,10 @@ def simulate(
     mirror = _stream(scene_id, Stream.MIRROR).random() < config.mirrored
     warp = None if config.warp is None else config.warp.draw(_stream(scene_id, Stream.WARP))
     if place is not None:
-        road_map, reversed_sides = _driven_on_right(place.road_map)
-        place, mirror = replace(place, road_map=road_map), mirror != reversed_sides
-        place = place if warp is None else replace(place, sees=place.sees / warp.least_scale)
+        road_map, is_mirror_image = _driven_on_right(place.road_map)
+        if is_mirror_image:
+            mirror = not mirror
+        place = Place(road_map, place.sees if warp is None else place.sees / warp.least_scale)
     density = 0.8 + 0.4 * config.severity
     amounts = replace(config.traffic, vehicles_per_metre=density * config.traffic.vehicles_per_metre)
     if place is None:
@@ -202,7 +206,7 @@ def simulate(
             network.map,
             scene_id,
             config.markers,
-            _chosen_by_sight(network.map, scene_id, config, warp, mirror),
+            _sight_test(network.map, scene_id, config, warp, mirror),
             global_from_ego,
         ),
     )
@@ -241,7 +245,7 @@ def _drive(
     """
     network = build_road_network(_stream(scene_id, Stream.ROADS), config.roads)
     for attempt in range(_DRIVES):
-        traffic = _traffic(*_attempt(scene_id, attempt), network, amounts, config, history)
+        traffic = _traffic(scene_id, attempt, network, amounts, config, history)
         on_roads, on_route = (np.arange(history, end) for end in (traffic.on_roads, traffic.on_route))
         if traffic.on_roads < config.frames and len(on_route) >= _needed(config, history):
             return network, traffic, on_route
@@ -257,12 +261,6 @@ def _drive(
 def _needed(config: WorldConfig, history: int) -> int:
     """Return how many frames a drive must offer for key frames."""
     return min(config.keyframes * _LEAST_STEP, config.frames - history)
-
-
-def _attempt(scene_id: int, attempt: int) -> tuple[np.random.Generator, np.random.Generator]:
-    """Return the streams of a drive and of its excerpt; those of the first attempt are those of `_stream`."""
-    drive, cut = (np.random.default_rng([ROOT, scene_id, one, attempt]) for one in (Stream.TRAFFIC, Stream.EXCERPT))
-    return drive, cut
 
 
 def _drive_on(
@@ -287,7 +285,7 @@ def _drive_on(
             sees=place.sees,
             leads_s=passes + EGO_JOINS,
         )
-        traffic = _traffic(*_attempt(scene_id, attempt), network, amounts, config, history)
+        traffic = _traffic(scene_id, attempt, network, amounts, config, history)
         assert network.drive is not None
         complete = history + np.flatnonzero(network.drive.covers(traffic.ego[history : traffic.on_roads, :2]))
         if len(complete) >= needed:
@@ -300,18 +298,18 @@ def _drive_on(
 
 
 def _traffic(
-    stream: np.random.Generator,
-    cut: np.random.Generator,
-    network: RoadNetwork,
-    amounts: TrafficConfig,
-    config: WorldConfig,
-    history: int,
+    scene_id: int, attempt: int, network: RoadNetwork, amounts: TrafficConfig, config: WorldConfig, history: int
 ) -> Traffic:
-    """Return the traffic that a scene shows; `cut` draws which part of a longer drive that is."""
+    """Return the traffic that a scene shows: of a drive that is longer, an excerpt.
+
+    The streams of attempt 0 are those of `_stream`.
+    """
     longer = round(config.longer_s * config.rate_hz)
-    traffic = simulate_traffic(stream, network, amounts, frames=config.frames + longer, rate_hz=config.rate_hz)
+    drive = np.random.default_rng([ROOT, scene_id, Stream.TRAFFIC, attempt])
+    traffic = simulate_traffic(drive, network, amounts, frames=config.frames + longer, rate_hz=config.rate_hz)
     if not longer:
         return traffic
+    cut = np.random.default_rng([ROOT, scene_id, Stream.EXCERPT, attempt])
     return excerpt(cut, network.traffic_lanes, traffic, frames=config.frames, history=history, rate_hz=config.rate_hz)
 
 

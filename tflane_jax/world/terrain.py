@@ -63,7 +63,7 @@ def on_terrain(log: Log, terrain: Terrain) -> Log:
     level = log.global_from_ego
     poses = terrain.pose(level[:, :2, 3], pose_yaw(level))
     moments = (replace(moment, global_from_ego=poses[moment.track_frame]) for moment in log.keyframes)
-    tracks, actors = moved_boxes(log, lambda boxes: _tracks(boxes, level, poses, terrain))
+    tracks, actors = moved_boxes(log, lambda boxes: _raised_tracks(boxes, level, poses, terrain))
     return replace(
         log,
         map=moved_map(log.map, lambda line: terrain.raised(with_vertices(line)), terrain.raised),
@@ -76,19 +76,21 @@ def on_terrain(log: Log, terrain: Terrain) -> Log:
     )
 
 
-def _tracks(level: Tracks, poses: np.ndarray, raised: np.ndarray, terrain: Terrain) -> Tracks:
-    """Return boxes, each in the frame of its own moment, of vehicles that stand on the ground."""
-    there = terrain.raised(transform_points(poses, level.position))
-    position = transform_points(invert_pose(raised), there)
-    yaw = level.yaw + pose_yaw(poses)[:, None]
+def _raised_tracks(
+    tracks: Tracks, old_poses: Float[np.ndarray, "f 4 4"], new_poses: Float[np.ndarray, "f 4 4"], terrain: Terrain
+) -> Tracks:
+    """Return boxes of vehicles that stand on the ground; poses are global_from_ego of the frames, before and after."""
+    places = terrain.raised(transform_points(old_poses, tracks.position))  # global
+    position = transform_points(invert_pose(new_poses), places)
+    yaw = tracks.yaw + pose_yaw(old_poses)[:, None]
     ahead = np.stack([np.cos(yaw), np.sin(yaw)], -1)
-    ahead = np.concatenate([ahead, (terrain.slope(there[..., :2]) * ahead).sum(-1, keepdims=True)], -1)
-    ahead = ahead @ raised[:, :3, :3]  # into the ego frame
+    ahead = np.concatenate([ahead, (terrain.slope(places[..., :2]) * ahead).sum(-1, keepdims=True)], -1)
+    ahead = ahead @ new_poses[:, :3, :3]  # into the ego frame
     yaw = np.arctan2(ahead[..., 1], ahead[..., 0])
     return replace(
-        level,
-        position=np.where(level.valid[..., None], position, level.position),
-        yaw=np.where(level.valid, yaw, level.yaw),
+        tracks,
+        position=np.where(tracks.valid[..., None], position, tracks.position),
+        yaw=np.where(tracks.valid, yaw, tracks.yaw),
     )
 
 

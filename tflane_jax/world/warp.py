@@ -113,7 +113,7 @@ def warped(log: Log, warp: Warp) -> Log:
     at, yaw = log.global_from_ego[:, :2, 3], pose_yaw(log.global_from_ego)
     there = warp.moved(at)
     poses = yaw_pose(there[:, 0], there[:, 1], warp.turned(at, yaw))
-    tracks, actors = moved_boxes(log, lambda boxes: _tracks(boxes, log.global_from_ego, poses, warp))
+    tracks, actors = moved_boxes(log, lambda boxes: _warped_tracks(boxes, log.global_from_ego, poses, warp))
     markers = log.markers
     return replace(
         log,
@@ -122,7 +122,7 @@ def warped(log: Log, warp: Warp) -> Log:
         tracks=tracks,
         actors=actors,
         keyframes=tuple(replace(moment, global_from_ego=poses[moment.track_frame]) for moment in log.keyframes),
-        markers=None if markers is None else replace(markers, pose=_boards(markers.pose, warp)),
+        markers=None if markers is None else replace(markers, pose=_warped_boards(markers.pose, warp)),
     )
 
 
@@ -139,19 +139,21 @@ def warped_map(found: VectorMap, warp: Warp) -> VectorMap:
     return replace(moved, buildings=blocks, elements=tuple(elements))
 
 
-def _tracks(found: Tracks, poses: np.ndarray, there: np.ndarray, warp: Warp) -> Tracks:
-    """Return boxes, each in the frame of its own moment."""
-    at = transform_points(poses, found.position)
-    position = transform_points(invert_pose(there), warp.moved(at))
-    yaw = warp.turned(at[..., :2], found.yaw + pose_yaw(poses)[:, None]) - pose_yaw(there)[:, None]
+def _warped_tracks(
+    tracks: Tracks, old_poses: Float[np.ndarray, "f 4 4"], new_poses: Float[np.ndarray, "f 4 4"], warp: Warp
+) -> Tracks:
+    """Return boxes that moved and turned with the ground; poses are global_from_ego of the frames, before and after."""
+    old = transform_points(old_poses, tracks.position)  # global
+    position = transform_points(invert_pose(new_poses), warp.moved(old))
+    yaw = warp.turned(old[..., :2], tracks.yaw + pose_yaw(old_poses)[:, None]) - pose_yaw(new_poses)[:, None]
     return replace(
-        found,
-        position=np.where(found.valid[..., None], position, found.position),
-        yaw=np.where(found.valid, wrap_outside(yaw), found.yaw),
+        tracks,
+        position=np.where(tracks.valid[..., None], position, tracks.position),
+        yaw=np.where(tracks.valid, wrap_outside(yaw), tracks.yaw),
     )
 
 
-def _boards(poses: Float[np.ndarray, "m 4 4"], warp: Warp) -> Float[np.ndarray, "m 4 4"]:
+def _warped_boards(poses: Float[np.ndarray, "m 4 4"], warp: Warp) -> Float[np.ndarray, "m 4 4"]:
     """Return boards that have moved, and turned with the direction in which they face."""
     xy, yaw = poses[:, :2, 3], np.arctan2(poses[:, 1, 2], poses[:, 0, 2])
     turn = warp.turned(xy, yaw) - yaw

@@ -12,9 +12,10 @@ import warnings
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from tflane_jax.datasets.argoverse2_map import read_map
 from tflane_jax.datasets.argoverse2_poses import POSE_COLUMNS, poses_at, poses_of, read_poses
@@ -89,6 +90,14 @@ of Argoverse write as a track."""
 Keyframes = Literal["openlane_v2", "annotations"]
 
 
+class _Frames(NamedTuple):
+    """Times (nanoseconds) and poses of all frames of a log, and its key frames."""
+
+    times_ns: Int[np.ndarray, " f"]
+    global_from_ego: Float[np.ndarray, "f 4 4"]
+    keyframes: tuple[KeyFrame, ...]
+
+
 def load_log(
     folder: Path,
     *,
@@ -113,22 +122,23 @@ def load_log(
     """
     folder = Path(folder)
     boxes = _read_boxes(folder / ANNOTATIONS)
-    times, at_frames, moments = _drive(folder, boxes["timestamp_ns"], keyframes, openlane)
-    tracks = _tracks(boxes, times, categories, folder)
-    check_headings(tracks, at_frames, times, str(folder / ANNOTATIONS))
+    frames = _drive(folder, boxes["timestamp_ns"], keyframes, openlane)
+    tracks = _tracks(boxes, frames.times_ns, categories, folder)
+    check_headings(tracks, frames.global_from_ego, frames.times_ns, str(folder / ANNOTATIONS))
     city = VectorMap({})
     if with_map:
         city = read_map(folder / "map")
-        check_place([lane.centerline for lane in city.segments.values()], at_frames[:, :2, 3], f"{folder} and its map")
+        lanes = [lane.centerline for lane in city.segments.values()]
+        check_place(lanes, frames.global_from_ego[:, :2, 3], f"{folder} and its map")
     return Log(
         name=folder.name,
         source="argoverse2",
         map=city,
-        timestamps_ns=times,
-        global_from_ego=at_frames,
+        timestamps_ns=frames.times_ns,
+        global_from_ego=frames.global_from_ego,
         tracks=tracks,
         actors=tracks,
-        keyframes=moments,
+        keyframes=frames.keyframes,
         seed=zlib.crc32(folder.name.encode()),
         area=city_of(folder),
     )
@@ -137,13 +147,11 @@ def load_log(
 def log_outline(folder: Path, keyframes: Keyframes = "openlane_v2", openlane: Path | None = None) -> LogOutline:
     """Return the key frames of a log as `load_log` does, without reading boxes and map; raises UserError like it."""
     times = read_columns(folder / ANNOTATIONS, {"timestamp_ns": "integer"})["timestamp_ns"]
-    return LogOutline(folder.name, "argoverse2", city_of(folder), _drive(folder, times, keyframes, openlane)[2])
+    return LogOutline(folder.name, "argoverse2", city_of(folder), _drive(folder, times, keyframes, openlane).keyframes)
 
 
-def _drive(
-    folder: Path, box_times: np.ndarray, keyframes: Keyframes, openlane: Path | None
-) -> tuple[np.ndarray, np.ndarray, tuple[KeyFrame, ...]]:
-    """Return the times (F,) of all frames, their poses (F, 4, 4), and the key frames, given the times of all boxes."""
+def _drive(folder: Path, box_times: Int[np.ndarray, " n"], keyframes: Keyframes, openlane: Path | None) -> _Frames:
+    """Return the frames of a log, given the times of all boxes."""
     pose_times, poses = read_poses(folder)
     annotated = np.unique(box_times)
     if len(annotated) == 0:
@@ -151,23 +159,24 @@ def _drive(
             f"{folder / ANNOTATIONS} holds no annotated frame (the test split has none): use a train or val log"
         )
     check_interval(annotated, "nanoseconds", str(folder / ANNOTATIONS))
-    poses_at(annotated, pose_times, poses, folder)  # of these the file has the exact ones
+    poses_at(annotated, pose_times, poses, folder)  # raises where an annotated frame has no pose of its own time
     # Frames without a box have no time of their own: each takes that of a pose, as annotated ones have it.
     times = np.unique(pose_times[_nearest(pose_times, _with_empty_frames(annotated, folder))])
-    moments = annotated if keyframes == "annotations" else times[::_FRAMES_PER_KEYFRAME]
+    key_times = annotated if keyframes == "annotations" else times[::_FRAMES_PER_KEYFRAME]
     if keyframes == "openlane_v2" and openlane is not None:
-        moments = _annotated(openlane_timestamps(openlane).get(folder.name, moments), times, folder)
-    at_moments = zip(moments, poses_at(moments, pose_times, poses, folder), _nearest(times, moments), strict=True)
-    return (
+        key_times = _annotated(openlane_timestamps(openlane).get(folder.name, key_times), times, folder)
+    key_poses = poses_at(key_times, pose_times, poses, folder)
+    found = zip(key_times, key_poses, _nearest(times, key_times), strict=True)
+    return _Frames(
         times,
         poses[_nearest(pose_times, times)],
-        tuple(KeyFrame(int(time), pose, int(frame)) for time, pose, frame in at_moments),
+        tuple(KeyFrame(int(time), pose, int(frame)) for time, pose, frame in found),
     )
 
 
-def _annotated(moments: np.ndarray, times: np.ndarray, folder: Path) -> np.ndarray:
-    """Return the moments that have an annotated frame near them; warn of others, which a file cut short may lack."""
-    near = np.abs(times[_nearest(times, moments)] - moments) <= _NEAR * 1e9
+def _annotated(key_times: np.ndarray, times: np.ndarray, folder: Path) -> np.ndarray:
+    """Return the times that have an annotated frame near them; warn of others, which a file cut short may lack."""
+    near = np.abs(times[_nearest(times, key_times)] - key_times) <= _NEAR * 1e9
     if not near.any():
         raise UserError(
             f"{folder / ANNOTATIONS}: no key frame of OpenLane-V2 has an annotated frame within {_NEAR:g} s: download "
@@ -179,7 +188,7 @@ def _annotated(moments: np.ndarray, times: np.ndarray, folder: Path) -> np.ndarr
             f"{_NEAR:g} s and are left out; if the log has road users there, download the file again"
         )
         warnings.warn(message, LeftOutWarning, stacklevel=2)
-    return moments[near]
+    return key_times[near]
 
 
 def city_of(folder: Path) -> str:
@@ -254,7 +263,7 @@ def _tracks(
     tracks = Tracks(
         position=np.zeros((*shape, 3)),
         yaw=np.zeros(shape),
-        size=np.stack([boxes[c][first] for c in ("length_m", "width_m", "height_m")], -1),
+        size=np.stack([boxes[c][first] for c in _SIZE], -1),
         category=np.array([categories[c] for c in boxes["category"][first]], np.int32),
         occluded=np.zeros(shape, bool),
         valid=np.zeros(shape, bool),

@@ -100,7 +100,8 @@ def make_example(log: Log, keyframe: int, config: ExampleConfig) -> Example:
     moment = log.keyframes[keyframe]
     ego_from_global = invert_pose(moment.global_from_ego)
     prepared = prepare_map(log.map, bike_lanes=config.bike_lanes == "include")
-    boxes, buildings = occluder_boxes(log, keyframe), _buildings(log, ego_from_global)
+    boxes = occluder_boxes(log, keyframe)
+    buildings = _buildings(log, ego_from_global)
     rig = config.cameras
     bev, hidden = _bev(log, keyframe, config.sensor, prepared, ego_from_global, boxes, buildings)
     crop = partial(lane_graph, ego_from_global=ego_from_global, range_=config.range, boxes=boxes, buildings=buildings)
@@ -114,16 +115,19 @@ def make_example(log: Log, keyframe: int, config: ExampleConfig) -> Example:
         points=config.area_points,
         crossings=config.crossings,
     )
-    wanted = config.map_lines
-    map_lines, map_lines_dropped = (
-        (None, 0)
-        if wanted is None
-        else crop_map_lines(prepared.geometry, ego_from_global, config.range, wanted, boxes=boxes, buildings=buildings)
-    )
+    map_lines, map_lines_dropped = None, 0
+    if config.map_lines is not None:
+        map_lines, map_lines_dropped = crop_map_lines(
+            prepared.geometry, ego_from_global, config.range, config.map_lines, boxes=boxes, buildings=buildings
+        )
+    governed, number_of = segments, prepared.segment_of
+    if config.elements_of == "centerlines":
+        governed, number_of = lanes, prepared.chain_of
     elements, elements_dropped = traffic_elements(
         log.map.elements,
         attributes_at(log, keyframe),
-        *((prepared.chain_of, lanes) if config.elements_of == "centerlines" else (prepared.segment_of, segments)),
+        number_of,
+        governed,
         ego_from_global,
         config.range,
         capacity=config.elements,
@@ -134,7 +138,9 @@ def make_example(log: Log, keyframe: int, config: ExampleConfig) -> Example:
     flow, tracks_dropped = traffic_flow(
         log, keyframe, history=config.history, capacity=config.tracks, stride=stride, region=config.ground
     )
-    sd_map, lines_dropped = (None, 0) if config.sd_map is None else make_sd_map(log, keyframe, config.sd_map)
+    sd_map, sd_lines_dropped = None, 0
+    if config.sd_map is not None:
+        sd_map, sd_lines_dropped = make_sd_map(log, keyframe, config.sd_map)
     warn_dropped(
         config,
         lanes=lanes.dropped,
@@ -142,7 +148,7 @@ def make_example(log: Log, keyframe: int, config: ExampleConfig) -> Example:
         areas=areas_dropped,
         elements=elements_dropped,
         tracks=tracks_dropped,
-        **{"sd_map.lines": lines_dropped, "map_lines.lines": map_lines_dropped},
+        **{"sd_map.lines": sd_lines_dropped, "map_lines.lines": map_lines_dropped},
     )
     previous = log.keyframes[keyframe - 1] if keyframe > 0 else moment
     return Example(

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -46,6 +46,20 @@ _MARKINGS = {"none": LineType.NONE, "solid": LineType.SOLID, "dashed": LineType.
 _INSIDE, _LEAST_INSIDE = 60.0, 30.0
 
 
+class _Lane(NamedTuple):
+    """A lane as its feature describes it.
+
+    Attributes:
+        line: centerline, degrees as read, later metres.
+        properties: those that are not null.
+        name: of the feature, for messages.
+    """
+
+    line: Float[np.ndarray, "n 2"]
+    properties: Mapping[str, Any]
+    name: str
+
+
 def read_lanes(path: Path) -> RoadMap:
     """Read a map; its frame is x east, y north, in metres from the middle of its lanes.
 
@@ -53,28 +67,29 @@ def read_lanes(path: Path) -> RoadMap:
     a property of another type, or a map too small to drive on.
     """
     path = Path(path)
-    lanes: dict[str, tuple[np.ndarray, Mapping[str, Any], str]] = {}
+    lanes: dict[str, _Lane] = {}
     border, crossings = [], []
     for name, feature in read_features(path):
         geometry, properties = _record(feature, "geometry", name), _record(feature, "properties", name)
         kind = str(geometry.get("type"))
         given = {key: value for key, value in properties.items() if value is not None}
-        edge, walk = (given.get(one) == 1 for one in ("boundary", "crossing"))  # text is OpenStreetMap's
-        if not (edge or walk or given.keys() & {"lane", "successors"}):
+        # True and 1 count. OpenStreetMap's own tags, such as crossing=zebra, are texts and do not.
+        is_edge, is_crossing = given.get("boundary") == 1, given.get("crossing") == 1
+        if not (is_edge or is_crossing or given.keys() & {"lane", "successors"}):
             continue
         if kind == "GeometryCollection":
             raise UserError(f"{name} is a GeometryCollection: give each of its lines a feature of its own")
         if kind not in _DEPTHS:
             continue
         lines = _lines(geometry, kind, name)
-        if "lane" in given or not (edge or walk):
-            number = _identity(given.get("lane"), name)
+        if "lane" in given or not (is_edge or is_crossing):
+            lane_id = _identity(given.get("lane"), name)
             if "LineString" not in kind or len(lines) != 1:
-                raise UserError(f"{name}: lane {number} is a {kind} of {len(lines)} lines: a lane is one LineString")
-            if number in lanes:
-                raise UserError(f"{name} has the lane id {number} of an earlier feature: give it another one")
-            lanes[number] = lines[0], given, name
-        elif edge:
+                raise UserError(f"{name}: lane {lane_id} is a {kind} of {len(lines)} lines: a lane is one LineString")
+            if lane_id in lanes:
+                raise UserError(f"{name} has the lane id {lane_id} of an earlier feature: give it another one")
+            lanes[lane_id] = _Lane(lines[0], given, name)
+        elif is_edge:
             border += [(line, name) for line in lines]
         elif "Polygon" not in kind or len(lines) != 1 or len(lines[0]) != 5:
             raise UserError(f"{name}: a crossing is a Polygon of four corners, the first two along the walk")
@@ -82,17 +97,17 @@ def read_lanes(path: Path) -> RoadMap:
             crossings.append((lines[0], name))
     if not lanes:
         raise UserError(f"{path} holds no lane: a lane is a LineString with the property `lane`, its id")
-    sides: set[Side] = {_side(properties, name) for _, properties, name in lanes.values() if "traffic" in properties}
+    sides: set[Side] = {_side(lane.properties, lane.name) for lane in lanes.values() if "traffic" in lane.properties}
     if len(sides) > 1:
         raise UserError(f"{path}: traffic keeps to the left on some lanes and to the right on others: choose one side")
-    degrees = np.concatenate([line for line, _, _ in lanes.values()])
+    degrees = np.concatenate([lane.line for lane in lanes.values()])
     if np.ptp(degrees[:, 0]) > 180.0:  # the map spans the 180th meridian
         degrees[:, 0] %= 360.0
     middle = degrees.mean(0)
     longitude = (float(middle[0]) + 180.0) % 360.0 - 180.0
     origin = Origin(latitude=float(middle[1]), longitude=longitude, heading=90.0)
     segments = _segments(
-        {key: (_metres(line, origin, name), props, name) for key, (line, props, name) in lanes.items()}
+        {lane_id: lane._replace(line=_metres(lane.line, origin, lane.name)) for lane_id, lane in lanes.items()}
     )
     places, complete = _places(segments, path)
     flat = [tuple(_flat(_metres(line, origin, name)) for line, name in lines) for lines in (crossings, border)]
@@ -130,15 +145,16 @@ def _identity(value: Any, name: str) -> str:
     return str(value)
 
 
-def _segments(lanes: Mapping[str, tuple[np.ndarray, Mapping[str, Any], str]]) -> dict[int, LaneSegment]:
-    number = {key: i for i, key in enumerate(lanes)}
-    lines = {number[key]: _clean(line, name) for key, (line, _, name) in lanes.items()}
+def _segments(lanes: Mapping[str, _Lane]) -> dict[int, LaneSegment]:
+    """Return the segment of each lane, whose line is in metres, by the lane's number in the file."""
+    number = {lane_id: i for i, lane_id in enumerate(lanes)}
+    lines = {number[lane_id]: _clean(lane.line, lane.name) for lane_id, lane in lanes.items()}
     starts, ends = (np.stack([line[i] for line in lines.values()]) for i in (0, -1))
     touching = np.linalg.norm(ends[:, None] - starts, axis=-1) < _SAME_END
     np.fill_diagonal(touching, False)
     after: dict[int, tuple[int, ...]] = {}
-    for key, (_, properties, name) in lanes.items():
-        i = number[key]
+    for lane_id, (_, properties, name) in lanes.items():
+        i = number[lane_id]
         after[i] = tuple(np.flatnonzero(touching[i]).tolist())
         if "successors" in properties:
             listed = properties["successors"]
@@ -147,11 +163,11 @@ def _segments(lanes: Mapping[str, tuple[np.ndarray, Mapping[str, Any], str]]) ->
             wanted = [_identity(value, name) for value in listed]
             if unknown := set(wanted) - set(number):
                 raise UserError(f"{name}: successor {min(unknown)} is no lane of this file")
-            after[i] = tuple(dict.fromkeys(number[value] for value in wanted if value != key))
+            after[i] = tuple(dict.fromkeys(number[value] for value in wanted if value != lane_id))
     sides = boundaries({i: LaneOutline(line, None) for i, line in lines.items()}, {})
     segments = {}
-    for key, (_, properties, name) in lanes.items():
-        i = number[key]
+    for lane_id, (_, properties, name) in lanes.items():
+        i = number[lane_id]
         wider = _width(properties, name) / (2.0 * HALF_WIDTH)
         left, right = (lines[i] + wider * (side - lines[i]) for side in sides[i])
         segments[i] = LaneSegment(

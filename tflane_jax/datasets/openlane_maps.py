@@ -68,7 +68,7 @@ def read_segment(files: Sequence[Path]) -> RoadMap:
     Raises UserError, which names file and field, for a frame that is damaged or has no annotation, for a vehicle that
     jumps, and where no frame has a lane.
     """
-    lanes, edges, poses = _Lines(3), _Lines(1), []
+    lanes, edges, poses = _Lines(), _Lines(), []
     for path in files:
         names = SEGMENT if path.stem.endswith(SEGMENT.suffix) else CENTERLINE
         content, where = load_json(path), str(path)
@@ -91,7 +91,7 @@ def read_segment(files: Sequence[Path]) -> RoadMap:
         raise UserError(f"{latest} is not named after its time in nanoseconds or microseconds: take the file out")
     times = np.array([tick * _time(path) for path in files], np.int64)
     check_motion(places, times, [str(path) for path in files])
-    segments = dict(_segments(lanes, sides=files[0].stem.endswith(SEGMENT.suffix)))
+    segments = dict(_lane_segments(lanes, has_sides=files[0].stem.endswith(SEGMENT.suffix)))
     segment = files[0].parent.parent
     if not segments:
         raise UserError(f"{segment}: no frame has a lane: take another segment")
@@ -119,16 +119,17 @@ def _global(found: Annotation, pose: np.ndarray) -> list[tuple[np.ndarray, ...]]
 
 @dataclass
 class _Lines:
-    """Lines followed from frame to frame.
+    """Groups of lines followed from frame to frame: centerline, left and right of a lane, or one road edge.
+
+    The first line of a group decides which groups of two frames are the same.
 
     Attributes:
-        count: lines that belong together, of which the first decides what is the same.
-        parts: of each line found so far.
-        connector: whether each is in an intersection; kinds: (left, right) `LineType` of each.
-        after: numbers of the lines that continue each.
+        parts: lines of each group found so far.
+        connector: whether each is in an intersection.
+        kinds: (left, right) `LineType` of each.
+        after: numbers of the groups that continue each.
     """
 
-    count: int
     parts: list[tuple[np.ndarray, ...]] = field(default_factory=list)
     connector: list[bool] = field(default_factory=list)
     kinds: list[tuple[int, int]] = field(default_factory=list)
@@ -142,7 +143,7 @@ class _Lines:
         connector: Sequence[bool] | np.ndarray = (),
         kinds: Sequence[Sequence[int]] | np.ndarray = (),
     ) -> None:
-        """Take the lines of the next frame, global metres; one without length is passed over."""
+        """Take the groups of the next frame, global metres; one whose first line has no length is passed over."""
         found = [tuple(without_repeats(line, _SAME_POINT) for line in parts) for parts in found]
         rows = [row for row, parts in enumerate(found) if len(parts[0]) > 1]
         now, before = [found[row][0] for row in rows], list(self._numbers.values())
@@ -171,19 +172,25 @@ class _Lines:
                 self.after[a].add(b)
 
 
-def _segments(lanes: _Lines, *, sides: bool) -> Iterator[tuple[int, LaneSegment]]:
+def _lane_segments(lanes: _Lines, *, has_sides: bool) -> Iterator[tuple[int, LaneSegment]]:
+    """Yield the lanes by number, without those that lie wholly on a longer one.
+
+    Args:
+        lanes: of all frames.
+        has_sides: whether the files tell boundaries; lanes without any get those of a lane of the usual width.
+    """
     keep = _without_copies([parts[0] for parts in lanes.parts])
     lines = {i: lanes.parts[i][0] for i, number in enumerate(keep) if number == i and len(lanes.parts[i][0]) > 1}
     after: dict[int, set[int]] = {i: set() for i in lines}
     for i, following in enumerate(lanes.after):
         after.setdefault(keep[i], set()).update(keep[j] for j in following)
     # A side without length is none.
-    plain = {i: _plain(line) for i, line in lines.items() if not sides or min(map(len, lanes.parts[i])) < 2}
+    plain = {i: _plain(line) for i, line in lines.items() if not has_sides or min(map(len, lanes.parts[i])) < 2}
     beside = boundaries({i: LaneOutline(line[:, :2], None) for i, line in plain.items()}, {})
     for i, line in lines.items():
         left, right = lanes.parts[i][1:]
         if i in plain:
-            height = plain[i][:, 2] if sides else np.zeros(len(plain[i]))
+            height = plain[i][:, 2] if has_sides else np.zeros(len(plain[i]))
             left, right, line = (np.column_stack([one[:, :2], height]) for one in (*beside[i], plain[i]))
         yield (
             i,
@@ -252,6 +259,6 @@ def _without_copies(lines: Sequence[np.ndarray]) -> Int[np.ndarray, " n"]:
 
 
 def _plain(line: np.ndarray) -> Float[np.ndarray, "n 3"]:
-    """Return a line with points at most 2 m apart."""
+    """Return a line with points 2 to 4 m apart; of a shorter line its two ends."""
     along = arc_length(line)
     return sample_at(line, np.linspace(0.0, along[-1], max(int(along[-1] // 2) + 1, 2)))

@@ -14,7 +14,7 @@ from itertools import takewhile
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from tflane_jax.datasets.base import FrameInfo, Split, checked_index
 from tflane_jax.datasets.data_source import Choice, DataSource, first_or_nominal, split_config
@@ -43,7 +43,7 @@ from tflane_jax.datasets.photometric import PhotometricConfig
 from tflane_jax.datasets.view_images import TOPONET_SUBSET_A, ImageConfig, ImageFit, fit_image
 from tflane_jax.errors import UserError
 from tflane_jax.files.images import read_image
-from tflane_jax.files.openlane import CENTERLINE, SEGMENT
+from tflane_jax.files.openlane import CENTERLINE, SEGMENT, FieldNames, FrameKey
 from tflane_jax.geometry import relative_pose
 from tflane_jax.limits import Rules
 from tflane_jax.scene import CameraViews, Example
@@ -92,43 +92,46 @@ class OpenLaneV2Dataset:
         """Return one frame."""
         key = self.keys[checked_index(index, len(self), self.name)]
         config, files = self.config.example, self._files(index)
-        if (bare := [file.path for file in files if file.annotation is None]) and key.split != "test":
-            raise UserError(f"{bare[0]} has no annotation: of the splits, only test may have such frames")
-        annotations = [
-            None if file.annotation is None else read_annotation(file.annotation, names, f"{file.path}: annotation")
-            for file, names in zip(files, self._names, strict=True)
-        ]
-        example, by_flavour = _blank(self.config, None), dict(zip(self._names, annotations, strict=True))
-        lanes, segments, areas = example.lanes, example.segments, example.areas
-        kept_lanes = kept_segments = np.zeros(0, int)
-        if (found := by_flavour.get(CENTERLINE)) is not None:
-            lanes, kept_lanes = lane_graph(found, config.lanes, config.lane_points)
-        if (found := by_flavour.get(SEGMENT)) is not None:
-            segments, kept_segments = lane_graph(found, config.segments, config.segment_points)
-            areas = area_set(found, config.areas, config.area_points, config.crossings)
-        elements = example.traffic_elements
-        if annotations[0] is not None and elements is not None:
-            kept = kept_segments if self._names[0] is SEGMENT else kept_lanes
-            elements = element_set(annotations[0], elements, kept, self._fits[0])
+        truth, pose = self._truth(key, files), files[0].global_from_ego
+        flow = markers = sd_map = None
+        if self._tracks is not None:
+            flow = self._tracks.flow(key, pose, config)
+        if self._boards is not None:
+            markers = self._boards.observations(key.scene, index - self._first[key.scene])
+        if self._sd_maps is not None and config.sd_map is not None:
+            sd_map = self._sd_maps.around(key, pose, config.sd_map)
         before = index > 0 and self.keys[index - 1].segment == key.segment
-        pose = files[0].global_from_ego
         return replace(
-            example,
-            traffic_flow=None if self._tracks is None else self._tracks.flow(key, pose, config),
-            markers=None
-            if self._boards is None
-            else self._boards.observations(key.scene, index - self._first[key.scene]),
-            sd_map=None
-            if self._sd_maps is None or config.sd_map is None
-            else self._sd_maps.around(key, pose, config.sd_map),
-            lanes=lanes,
-            segments=segments,
-            areas=areas,
-            traffic_elements=elements,
+            truth,
+            traffic_flow=flow,
+            markers=markers,
+            sd_map=sd_map,
             previous_from_ego=relative_pose(self._pose(index - 1) if before else pose, pose).astype(np.float32),
             has_previous=np.asarray(before),
             cameras=self._views(files[0]),
         )
+
+    def _truth(self, key: FrameKey, files: list[FrameFile]) -> Example:
+        """Return an example with nothing but what a frame's files annotate; traffic elements are those of the first."""
+        if (bare := [file.path for file in files if file.annotation is None]) and key.split != "test":
+            raise UserError(f"{bare[0]} has no annotation: of the splits, only test may have such frames")
+        found = {
+            names: read_annotation(file.annotation, names, f"{file.path}: annotation")
+            for file, names in zip(files, self._names, strict=True)
+            if file.annotation is not None
+        }
+        config, example = self.config.example, _blank(self.config, None)
+        lanes, segments, areas = example.lanes, example.segments, example.areas
+        kept: dict[FieldNames, Int[np.ndarray, " n"]] = {}
+        if CENTERLINE in found:
+            lanes, kept[CENTERLINE] = lane_graph(found[CENTERLINE], config.lanes, config.lane_points)
+        if SEGMENT in found:
+            segments, kept[SEGMENT] = lane_graph(found[SEGMENT], config.segments, config.segment_points)
+            areas = area_set(found[SEGMENT], config.areas, config.area_points, config.crossings)
+        elements, first = example.traffic_elements, self._names[0]
+        if first in found and elements is not None:
+            elements = element_set(found[first], elements, kept[first], self._fits[0])
+        return replace(example, lanes=lanes, segments=segments, areas=areas, traffic_elements=elements)
 
     def first_unlabelled(self) -> Path | None:
         """Return the first frame's file if it has no annotation."""
@@ -153,10 +156,10 @@ class OpenLaneV2Dataset:
         return int(self.keys[index].timestamp) * SUBSETS[self.config.subset].tick_ns
 
     @property
-    def _names(self):
-        return {"centerline": (CENTERLINE,), "lane_segment": (SEGMENT,), "both": (CENTERLINE, SEGMENT)}[
-            self.config.flavour
-        ]
+    def _names(self) -> tuple[FieldNames, ...]:
+        """Names of the fields of each file that is read of a frame."""
+        files = {"centerline": (CENTERLINE,), "lane_segment": (SEGMENT,), "both": (CENTERLINE, SEGMENT)}
+        return files[self.config.flavour]
 
     @property
     def _suffixes(self) -> list[str]:

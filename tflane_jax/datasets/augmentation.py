@@ -100,17 +100,18 @@ def draw_warp(
 
     It maps columns and rows of the old image to those of the new, pixels, (0, 0) the outer corner of the first pixel.
     """
-    chance, angle, mirror, left, top = rng.uniform(size=5)
+    chance, turn, mirror, left, top = rng.uniform(size=5)
     if chance >= config.geometry:
         return None
-    angle = config.rotation * (2.0 * angle - 1.0)
+    angle = config.rotation * (2.0 * turn - 1.0)
     cos, sin = math.cos(angle), math.sin(angle)
     x, y = width / 2.0, height / 2.0
     rotate = np.array([[cos, -sin, x - cos * x + sin * y], [sin, cos, y - sin * x - cos * y], [0.0, 0.0, 1.0]])
-    flipped = mirror < config.flip
-    flip = np.array([[-1.0 if flipped else 1.0, 0.0, width if flipped else 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
-    left, top = left * (1.0 - config.crop) * width, top * (1.0 - config.crop) * height
-    crop = np.array([[1.0, 0.0, -left], [0.0, 1.0, -top], [0.0, 0.0, config.crop]]) / config.crop
+    flip = np.eye(3)
+    if mirror < config.flip:
+        flip = np.array([[-1.0, 0.0, width], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    x_cut, y_cut = left * (1.0 - config.crop) * width, top * (1.0 - config.crop) * height
+    crop = np.array([[1.0, 0.0, -x_cut], [0.0, 1.0, -y_cut], [0.0, 0.0, config.crop]]) / config.crop
     warp = crop @ flip @ rotate
     return None if (warp == np.eye(3)).all() else warp
 
@@ -165,17 +166,20 @@ def warp_lines(lines: LaneLines, warp: Float[np.ndarray, "3 3"], height: int, wi
 
 
 def _before_the_bend(row: Float[np.ndarray, "l p"], valid: Bool[np.ndarray, "l p"]) -> Bool[np.ndarray, "l p"]:
-    """Return the valid points from a line's last one, which is nearest, to where its rows turn back.
+    """Return which valid points to keep: from a line's last point, the nearest to the vehicle, back to the first bend.
 
-    A line has one point in a row.
+    At a bend the rows begin to run against those at the line's end. Beyond it the line would have a second point in
+    rows that it already has, which `LaneLines` cannot hold.
     """
     places = np.argsort(~valid, axis=-1, kind="stable")  # the valid points first, in their order
-    step, count = np.diff(np.take_along_axis(row, places, -1)), valid.sum(-1, keepdims=True)
-    last = np.take_along_axis(step, np.maximum(count - 2, 0), -1) if step.size else 0.0
-    turns = (np.arange(step.shape[-1]) < count - 1) & (step * last < 0.0)
-    beyond = np.logical_or.accumulate(turns[:, ::-1], -1)[:, ::-1]
+    step = np.diff(np.take_along_axis(row, places, -1))  # in rows, to the next point
+    count = valid.sum(-1, keepdims=True)
+    last_step = np.take_along_axis(step, np.maximum(count - 2, 0), -1) if step.size else 0.0
+    bends = (np.arange(step.shape[-1]) < count - 1) & (step * last_step < 0.0)
+    beyond = np.logical_or.accumulate(bends[:, ::-1], -1)[:, ::-1]
+    before_last = places[:, :-1]
     kept = valid.copy()
-    np.put_along_axis(kept, places[:, :-1], np.take_along_axis(valid, places[:, :-1], -1) & ~beyond, -1)
+    np.put_along_axis(kept, before_last, np.take_along_axis(valid, before_last, -1) & ~beyond, -1)
     return kept
 
 

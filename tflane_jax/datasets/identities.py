@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from tflane_jax.geometry import invert_pose, line_distances, transform_points
 from tflane_jax.scene import Example
@@ -21,12 +21,12 @@ _FAR = 1e6
 
 
 @dataclass
-class _Kind:
+class _Items:
     """Items of one kind in the latest frame: shapes, labels and ids of the valid rows."""
 
     lines: np.ndarray = field(default_factory=lambda: np.zeros((0, 2, 3)))
     label: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
-    names: list[str] = field(default_factory=list)
+    ids: list[str] = field(default_factory=list)
 
 
 class Identities:
@@ -41,7 +41,7 @@ class Identities:
         self.segments: dict[int, str] = {}
         self.areas: dict[int, str] = {}
         self.elements: dict[int, str] = {}
-        self._before: dict[str, _Kind] = {}
+        self._before: dict[str, _Items] = {}
         self._count = 0
 
     def step(self, example: Example) -> None:
@@ -60,23 +60,29 @@ class Identities:
             self.elements = self._next("element", place, elements.category, elements.valid, ego_from_previous)
 
     def _next(
-        self, kind: str, lines: np.ndarray, label: np.ndarray | None, valid: Bool[np.ndarray, " n"], moved: np.ndarray
+        self,
+        kind: str,
+        lines: Float[np.ndarray, "n p 3"],
+        label: Int[np.ndarray, " n"] | None,
+        valid: Bool[np.ndarray, " n"],
+        ego_from_previous: Float[np.ndarray, "4 4"],
     ) -> dict[int, str]:
+        """Return the ids of one kind's items in the next frame, by row, for valid rows."""
         rows = np.flatnonzero(valid)
-        now = _Kind(
-            np.asarray(lines, np.float64)[rows], np.zeros(len(rows), int) if label is None else np.asarray(label)[rows]
-        )
-        before, names = self._before.get(kind, _Kind()), {}
-        if len(rows) and len(before.names):
-            cost = _separation(now, _Kind(transform_points(moved, before.lines), before.label))
-            names = {row: before.names[column] for row, column in pairs_within(cost, _SAME).items()}
-        for row in range(len(rows)):
-            if row not in names:
-                names[row] = str(self._count)
+        label = np.zeros(len(rows), int) if label is None else np.asarray(label)[rows]
+        now = _Items(np.asarray(lines, np.float64)[rows], label)
+        before, ids = self._before.get(kind, _Items()), {}
+        if len(rows) and len(before.ids):
+            moved = _Items(transform_points(ego_from_previous, before.lines), before.label)
+            pairs = pairs_within(_separation(now, moved), _SAME)
+            ids = {item: before.ids[previous] for item, previous in pairs.items()}
+        for item in range(len(rows)):
+            if item not in ids:
+                ids[item] = str(self._count)
                 self._count += 1
-        now.names = [names[row] for row in range(len(rows))]
+        now.ids = [ids[item] for item in range(len(rows))]
         self._before[kind] = now
-        return {int(place): now.names[row] for row, place in enumerate(rows)}
+        return dict(zip(rows.tolist(), now.ids, strict=True))
 
 
 def pairs_within(apart: Float[np.ndarray, "n m"], limit: float) -> dict[int, int]:
@@ -91,7 +97,7 @@ def pairs_within(apart: Float[np.ndarray, "n m"], limit: float) -> dict[int, int
     return {int(row): int(column) for row, column in pairs if apart[row, column] < limit}
 
 
-def _separation(now: _Kind, before: _Kind) -> Float[np.ndarray, "n m"]:
+def _separation(now: _Items, before: _Items) -> Float[np.ndarray, "n m"]:
     """Return the distance of items: the smaller of the two mean distances from one to the other.
 
     The smaller one, because a line may be cut shorter. A small part of the other direction decides between lines that

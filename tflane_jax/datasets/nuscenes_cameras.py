@@ -53,10 +53,13 @@ def sample_cameras(
     Raises:
         UserError: a camera matrix or a pose is malformed.
     """
-    return tuple(
-        _camera(tables, sample, name, row, global_from_ego, frame_from_ego, poses) if row is not None else None
-        for name, row in ((name, tables.data.get(sample["token"], {}).get(name)) for name in CAMERAS)
-    )
+    cameras: list[FrameCamera | None] = [None] * len(CAMERAS)
+    channels = _channels(tables, sample)
+    for place, name in enumerate(CAMERAS):
+        if name in channels:
+            row = channels[name]
+            cameras[place] = _camera(tables, sample, name, row, global_from_ego, frame_from_ego, poses)
+    return tuple(cameras)
 
 
 def _camera(
@@ -130,7 +133,7 @@ def camera_fits(tables: Tables, config: ImageConfig) -> tuple[ImageFit | None, .
     for channels in tables.data.values():
         for name in CAMERAS:
             if name in channels:
-                _note_size(sizes, name, channels[name], tables)
+                _check_size(sizes, name, channels[name], tables)
     if not sizes:
         raise UserError(f"{tables.folder}: no sample has a camera")
     return tuple(
@@ -138,7 +141,8 @@ def camera_fits(tables: Tables, config: ImageConfig) -> tuple[ImageFit | None, .
     )
 
 
-def _note_size(sizes: dict[str, tuple[int, int]], name: str, row: Row, tables: Tables) -> None:
+def _check_size(sizes: dict[str, tuple[int, int]], name: str, row: Row, tables: Tables) -> None:
+    """Keep the first size of a camera's images in `sizes`; raise UserError for another one, or an impossible one."""
     size, where = (row["width"], row["height"]), tables.where("sample_data", row["token"])
     if not 1 <= min(size) <= max(size) <= LARGEST_IMAGE:
         raise UserError(f"{where}: images of {name} are {size[0]} x {size[1]} pixels, expected 1 to {LARGEST_IMAGE}")
@@ -151,19 +155,16 @@ def _note_size(sizes: dict[str, tuple[int, int]], name: str, row: Row, tables: T
 
 def missing_images(tables: Tables, samples: Sequence[Row]) -> list[str]:
     """Return the image files of samples that do not exist, relative to the data set's folder."""
-    rows = (
-        channels[name]
-        for sample in samples
-        for channels in [_channels(tables, sample)]
-        for name in CAMERAS
-        if name in channels
-    )
-    return [
-        row["filename"]
-        for row in rows
-        if not file_within(tables.root, row["filename"], tables.where("sample_data", row["token"])).is_file()
-    ]
+    missing = []
+    for sample in samples:
+        channels = _channels(tables, sample)
+        for row in (channels[name] for name in CAMERAS if name in channels):
+            where = tables.where("sample_data", row["token"])
+            if not file_within(tables.root, row["filename"], where).is_file():
+                missing.append(row["filename"])
+    return missing
 
 
 def _channels(tables: Tables, sample: Row) -> Mapping[str, Row]:
+    """Return the sensor files of a sample by channel."""
     return tables.data.get(sample["token"], {})

@@ -49,33 +49,36 @@ class CameraChecks:
     def __init__(self, images: Images = "ends"):
         self._images: Images = images
         self._sizes: dict[str, Counter[tuple[int, int]]] = defaultdict(Counter)
-        self._strange: dict[tuple[Path, str, tuple[int, int]], _Repeated] = {}
+        self._of_size: dict[tuple[Path, str, tuple[int, int]], _Repeated] = {}
         self._calibration: dict[tuple[Path, str, str, tuple[int, int] | None], _Repeated] = {}
 
     def check(self, frame: FrameFile) -> tuple[int, list[str]]:
         """Return how many of a frame's images can be read, and the faults of the others."""
         intact, faults = 0, []
+        segment = frame.path.parent.parent
         for camera in frame.cameras:
             if camera is None:
                 continue
-            fault = damage_of(camera.image, self._images)
-            size = None if fault else image_size(camera.image)
-            intact += fault is None
-            faults += [] if fault is None else [f"{camera.image} {fault}"]
-            segment = frame.path.parent.parent
+            fault, size = damage_of(camera.image, self._images), None
+            if fault is None:
+                intact += 1
+                size = image_size(camera.image)
+            else:
+                faults.append(f"{camera.image} {fault}")
             if size is not None:
                 self._sizes[camera.name][size] += 1
-                self._strange.setdefault((segment, camera.name, size), _Repeated(str(camera.image))).count += 1
-            where = f"{frame.path}: {camera.name}"
-            every = {
-                "image": _of_another(camera),
-                "pose": _direction(camera) or _place(camera),
-                "scale": _scale(camera, size),
+                self._of_size.setdefault((segment, camera.name, size), _Repeated(str(camera.image))).count += 1
+            faults_by_kind = {
+                "image": _folder_fault(camera),
+                "pose": _direction_fault(camera) or _place_fault(camera),
+                "scale": _scale_fault(camera, size),
             }
-            for kind, found in every.items():
-                if found is not None:
-                    key = (segment, camera.name, kind, size if kind == "scale" else None)
-                    self._calibration.setdefault(key, _Repeated(f"{where} {found}")).count += 1
+            for kind, found in faults_by_kind.items():
+                if found is None:
+                    continue
+                key = (segment, camera.name, kind, size if kind == "scale" else None)
+                first = _Repeated(f"{frame.path}: {camera.name} {found}")
+                self._calibration.setdefault(key, first).count += 1
         return intact, faults
 
     def finish(self) -> tuple[int, list[str]]:
@@ -85,12 +88,13 @@ class CameraChecks:
         """
         usual = {name: sizes.most_common(1)[0][0] for name, sizes in self._sizes.items()}
         strange, faults = 0, []
-        for (_, name, size), found in self._strange.items():
-            if size != usual[name]:
-                strange += found.count
-                most = f"{usual[name][0]} x {usual[name][1]}"
-                text = f"{found.text} is {size[0]} x {size[1]} pixels, most images of {name} are {most}"
-                faults.append(text + found.others("images"))
+        for (_, name, size), found in self._of_size.items():
+            if size == usual[name]:
+                continue
+            strange += found.count
+            most = f"{usual[name][0]} x {usual[name][1]}"
+            text = f"{found.text} is {size[0]} x {size[1]} pixels, most images of {name} are {most}"
+            faults.append(text + found.others("images"))
         # The intrinsics fit the usual images.
         faults += [
             found.text + found.others("frames")
@@ -102,7 +106,7 @@ class CameraChecks:
 
 @dataclass
 class _Repeated:
-    """A fault as first found in a segment, and how often it was."""
+    """What was first found in a segment, a fault or an image of some size, and how often."""
 
     text: str
     count: int = 0
@@ -171,7 +175,7 @@ def _scan_start(content: bytes) -> int:
     return len(content)
 
 
-def _of_another(camera: FrameCamera) -> str | None:
+def _folder_fault(camera: FrameCamera) -> str | None:
     """Return what is wrong with an image that is in the folder of another camera."""
     others = [name for name in camera.image.parts if name in _MOUNTS and name != camera.name]
     if not others or camera.name in camera.image.parts:
@@ -179,16 +183,17 @@ def _of_another(camera: FrameCamera) -> str | None:
     return f"has the image {camera.image}, which is in the folder of {others[-1]}"
 
 
-def _direction(camera: FrameCamera) -> str | None:
+def _direction_fault(camera: FrameCamera) -> str | None:
     """Return what is wrong with where a camera looks."""
     axis = camera.ego_from_camera[:3, 2]
     mount = _MOUNTS.get(camera.name)
     if mount is None:
         return None
     if _apart(axis, mount.yaw) <= _TURNED:
-        return _rolled(camera)
+        return _roll_fault(camera)
     expected = mount.yaw
-    looks, other = float(np.rad2deg(np.arctan2(axis[1], axis[0]))), _others(axis, camera.name)
+    looks = float(np.rad2deg(np.arctan2(axis[1], axis[0])))
+    other = _camera_looking_along(axis, camera.name)
     text = f"looks to {looks:.0f} degrees (left of ahead), expected about {expected:.0f}"
     if expected == 0.0:
         text = f"does not look ahead but to {looks:.0f} degrees"
@@ -201,7 +206,7 @@ def _direction(camera: FrameCamera) -> str | None:
     return f"{text}: is its extrinsic that of the camera's axes (x right, y down, z ahead) in the ego frame?"
 
 
-def _rolled(camera: FrameCamera) -> str | None:
+def _roll_fault(camera: FrameCamera) -> str | None:
     """Return what is wrong with how a camera is turned about its optical axis."""
     down = camera.ego_from_camera[:3, 1] @ np.array([0.0, 0.0, -1.0])
     if down >= np.cos(np.deg2rad(_TURNED)):
@@ -220,7 +225,7 @@ def _inverted(camera: FrameCamera, yaw: float) -> bool:
     return upright(rotation.T) and not upright(rotation) and _apart(rotation[2], yaw) <= _TURNED
 
 
-def _others(axis: Float[np.ndarray, "3"], name: str) -> str | None:
+def _camera_looking_along(axis: Float[np.ndarray, "3"], name: str) -> str | None:
     """Return another camera of the same ring that should look along the axis."""
     ring = ARGOVERSE2_RING if name in {mount.name for mount in ARGOVERSE2_RING} else NUSCENES_RING
     near = {mount.name: _apart(axis, mount.yaw) for mount in ring if mount.name != name}
@@ -234,7 +239,7 @@ def _apart(axis: Float[np.ndarray, "3"], yaw: float) -> float:
     return float(np.rad2deg(np.arccos(np.clip(axis @ level, -1.0, 1.0))))
 
 
-def _place(camera: FrameCamera) -> str | None:
+def _place_fault(camera: FrameCamera) -> str | None:
     """Return what is wrong with where a camera is."""
     metres = float(np.linalg.norm(camera.ego_from_camera[:3, 3]))
     if metres > _FARTHEST:
@@ -253,14 +258,14 @@ def _place(camera: FrameCamera) -> str | None:
     )
 
 
-def _scale(camera: FrameCamera, size: tuple[int, int] | None) -> str | None:
+def _scale_fault(camera: FrameCamera, size: tuple[int, int] | None) -> str | None:
     """Return what is wrong with the intrinsics for images of this size."""
     if size is None:
         return None
     middle = camera.intrinsics[:2, 2] / size
     focal = camera.intrinsics[0, 0] / size[0]
     central = (np.abs(middle - 0.5) <= _ASIDE).all() and _FOCAL[0] <= focal <= _FOCAL[1]
-    if central and _relative(camera, size) <= _NOMINAL:
+    if central and _focal_deviation(camera, size) <= _NOMINAL:
         return None
     fx, fy = camera.intrinsics[0, 0], camera.intrinsics[1, 1]
     if central and abs(fy / fx - 1.0) > _NOMINAL:
@@ -281,7 +286,7 @@ def _scale(camera: FrameCamera, size: tuple[int, int] | None) -> str | None:
     )
 
 
-def _relative(camera: FrameCamera, size: tuple[int, int]) -> float:
+def _focal_deviation(camera: FrameCamera, size: tuple[int, int]) -> float:
     """Return how far the focal lengths are from that of the dataset's cameras of this name, as a fraction.
 
     In widths or in heights of the image, whichever is nearer: one of them may have been cropped or padded. Two focal

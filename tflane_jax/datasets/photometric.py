@@ -109,27 +109,30 @@ def distort(
     """Return one RGB image with its brightness, contrast, saturation, hue and channels changed at random (a copy)."""
     cv2 = opencv()
     # All random numbers are drawn in every case, so that a setting changes only its own effect.
-    changes = rng.uniform(size=4) < config.probability
-    early, swapped = rng.uniform() < 0.5, rng.uniform() < config.swap
+    with_brightness, with_contrast, with_saturation, with_hue = rng.uniform(size=4) < config.probability
+    contrast_first = rng.uniform() < 0.5
+    swapped = rng.uniform() < config.swap
     brightness = rng.uniform(-config.brightness, config.brightness)
-    contrast, saturation = rng.uniform(*config.contrast), rng.uniform(*config.saturation)
-    hue, order = rng.uniform(-config.hue, config.hue), rng.permutation(3)
+    contrast = rng.uniform(*config.contrast)
+    saturation = rng.uniform(*config.saturation)
+    hue = rng.uniform(-config.hue, config.hue)
+    order = rng.permutation(3)
 
     out = image.astype(np.float32)
-    if changes[0]:
+    if with_brightness:
         out += np.float32(brightness)
-    if changes[1] and early:
+    if with_contrast and contrast_first:
         out *= np.float32(contrast)
-    if changes[2] or changes[3]:
+    if with_saturation or with_hue:
         # Hue in degrees, saturation 0 to 1. Negative values have no hue.
         colour = cv2.cvtColor(np.maximum(out, 0.0), cv2.COLOR_RGB2HSV)
-        if changes[2]:
+        if with_saturation:
             colour[..., 1] = np.minimum(colour[..., 1] * np.float32(saturation), 1.0)
-        if changes[3]:
+        if with_hue:
             # OpenCV wraps hues above 360 degrees, but not negative ones; np.mod would take as long as all other steps.
             colour[..., 0] += np.float32(hue % 360.0)
         out = cv2.cvtColor(colour, cv2.COLOR_HSV2RGB)
-    if changes[1] and not early:
+    if with_contrast and not contrast_first:
         out *= np.float32(contrast)
     if swapped:
         out = out[..., order]
@@ -145,10 +148,10 @@ def draw_grid(
     as many as fit into 1.5 times the image; a pixel is hidden if it is in no stripe of either kind. As in TopoNet's
     code, a long period leaves rows before the first stripe or behind the last one.
     """
-    chance, period, row, column = rng.uniform(size=4)
+    chance, length, row, column = rng.uniform(size=4)
     if chance >= config.grid_mask or height < 3:
         return None
-    period = 2 + int(period * (height - 2))
+    period = 2 + int(length * (height - 2))
     kept = min(max(int(period * config.grid_ratio + 0.5), 1), period - 1)
     rows, columns = (
         _between_stripes(size, period, kept, int(start * period)) for size, start in ((height, row), (width, column))

@@ -16,6 +16,7 @@ from collections.abc import Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -68,6 +69,24 @@ class TuSimpleConfig:
     loading: StreamingConfig = StreamingConfig()
 
 
+class _Frame(NamedTuple):
+    """A labelled frame.
+
+    Attributes:
+        name: of its image, as in the label file.
+        lanes: labels.
+        folder: from which the name starts.
+    """
+
+    name: str
+    lanes: RowLanes
+    folder: Path
+
+    @property
+    def image(self) -> Path:
+        return self.folder / self.name
+
+
 class TuSimpleDataset:
     """Labelled frames in the order of the label files.
 
@@ -85,30 +104,30 @@ class TuSimpleDataset:
         self.config = config
         self.name = f"tusimple-{'custom' if config.label_files else config.split}"
         self.label_files, self.absent_files = find_label_files(root, config.split, config.label_files)
-        labels: dict[str, tuple[RowLanes, Path]] = {}
+        frames: dict[str, _Frame] = {}
         for file in self.label_files:
             read = read_truth(file)
-            twice = next((name for name in read if name in labels), None)
+            twice = next((name for name in read if name in frames), None)
             if twice is not None:
                 raise UserError(f"{file} labels {twice}, which an earlier label file labels too: leave one of them out")
             for name in read:
                 file_within(root, name, f"{file}: raw_file")
             folder = image_folder(root, file, list(read))
-            labels |= {name: (lanes, folder) for name, lanes in read.items()}
-        self._labels = [(name, lanes, folder) for name, (lanes, folder) in labels.items()]
+            frames |= {name: _Frame(name, lanes, folder) for name, lanes in read.items()}
+        self._frames = list(frames.values())
         self._sizes: dict[str, tuple[int, int]] = {}  # of the images read so far
-        if not labels:
+        if not self._frames:
             raise UserError(f"{', '.join(map(str, self.label_files))}: no labelled frames")
-        missing = [name for name, _, folder in self._labels if not (folder / name).is_file()]
+        missing = [frame.name for frame in self._frames if not frame.image.is_file()]
         if missing:
             shown = ", ".join(missing[:3]) + (", ..." if len(missing) > 3 else "")
             raise UserError(
-                f"{root}: {len(missing)} of {len(labels)} labelled images are missing ({shown}): unpack TuSimple's "
+                f"{root}: {len(missing)} of {len(self)} labelled images are missing ({shown}): unpack TuSimple's "
                 "clips there, or keep only the records of the images at hand in a label file of your own"
             )
 
     def __len__(self) -> int:
-        return len(self._labels)
+        return len(self._frames)
 
     def summary(self) -> str:
         """Return one line of text: number of frames, label files found, label files missing."""
@@ -118,11 +137,11 @@ class TuSimpleDataset:
 
     def example(self, index: int) -> RoadImage:
         """Return one frame; raises UserError where its image cannot be read."""
-        name, truth, folder = self._labels[checked_index(index, len(self), self.name)]
-        image = read_image(folder / name)
-        height, width = self._sizes[name] = image.shape[:2]
+        frame = self._frames[checked_index(index, len(self), self.name)]
+        image = read_image(frame.image)
+        height, width = self._sizes[frame.name] = image.shape[:2]
         image = resize(image, self.config.height, self.config.width)
-        lines = lane_lines(truth, height=height, width=width, capacity=self.config.capacity)
+        lines = lane_lines(frame.lanes, height=height, width=width, capacity=self.config.capacity)
         return RoadImage(image, np.ones(image.shape[:2], bool), lines)
 
     def truth(self, index: int) -> RowLanes:
@@ -130,14 +149,14 @@ class TuSimpleDataset:
 
         Reads the image for its size if `example` has not; raises UserError where it cannot be read.
         """
-        name, truth, folder = self._labels[checked_index(index, len(self), self.name)]
-        if name not in self._sizes:
-            self._sizes[name] = read_image(folder / name).shape[:2]
-        return replace(truth, size=self._sizes[name])
+        frame = self._frames[checked_index(index, len(self), self.name)]
+        if frame.name not in self._sizes:
+            self._sizes[frame.name] = read_image(frame.image).shape[:2]
+        return replace(frame.lanes, size=self._sizes[frame.name])
 
     def raw_file(self, index: int) -> str:
         """Return the name that label and prediction files give a frame."""
-        return self._labels[checked_index(index, len(self), self.name)][0]
+        return self._frames[checked_index(index, len(self), self.name)].name
 
     def info(self, index: int) -> FrameInfo:
         """Return where one frame comes from; TuSimple gives neither time nor pose."""

@@ -52,15 +52,16 @@ def find_label_files(
     found = tuple(path for path in paths.values() if path.is_file())
     absent = tuple(name for name, path in paths.items() if not path.is_file())
     if not found or (named and absent):
+        files, them = ("label files", "them") if len(absent) > 1 else ("label file", "it")
+        whose, remedy = "`label_files`", "correct `label_files`"
         if not named:
             check_label_files(root)
+            whose, remedy = f"split {split}", _other_files(split, present)
+        has = ", ".join(sorted(present)) or "none"
         tasks = f"; {_TASKS} names the test images without their lanes" if _TASKS in present else ""
-        it = "them" if len(absent) > 1 else "it"
         raise UserError(
-            f"{root} lacks the label file{'s' * (len(absent) != 1)} {', '.join(absent)} of "
-            f"{'`label_files`' if named else f'split {split}'} (it has {', '.join(sorted(present)) or 'none'}{tasks}): "
-            f"add {it} from TuSimple's archive, or "
-            f"{'correct `label_files`' if named else _other_files(split, present)}"
+            f"{root} lacks the {files} {', '.join(absent)} of {whose} (it has {has}{tasks}): "
+            f"add {them} from TuSimple's archive, or {remedy}"
         )
     return found, absent
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from tflane_jax.datasets.plausible import check_steps, first_twice, left_of
+from tflane_jax.datasets.plausible import area_between, check_steps, first_twice
 from tflane_jax.datasets.shapely_polygons import flat_rings, import_shapely
 from tflane_jax.errors import UserError
 from tflane_jax.files.fields import items, load_json, member, numbers, whole_number
@@ -90,7 +90,7 @@ def _lane_segment(record: Any, where: str) -> LaneSegment:
     if number in successors:
         raise UserError(f"{where} is its own successor: download it again")
     sides = resample(left, _CENTERLINE_POINTS), resample(right, _CENTERLINE_POINTS)
-    if left_of(*sides) < 0.0:
+    if area_between(*sides) < 0.0:
         raise UserError(f"{where}: the left boundary is to the right of the right one, in driving direction")
     flags = member(record, "is_intersection", where), member(record, "lane_type", where)
     if not isinstance(flags[0], bool) or not isinstance(flags[1], str):

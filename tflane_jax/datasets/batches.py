@@ -131,7 +131,7 @@ def batches(
             # Not np.take: that copies the whole of a leaf that is a broadcast view.
             part = jax.tree.map(lambda leaf, indices=indices: leaf[indices], arrays)
             if prepare is not None:
-                keys = [(seed, step, place) for place in order.places]
+                keys = [(seed, step, row) for row in order.places]
                 part = stack_examples([prepare(row_of(part, i), key) for i, key in enumerate(keys)])
             parts.append(part)
         return parts

@@ -145,7 +145,13 @@ def _boundary_of(part: np.ndarray, line: np.ndarray, whole: np.ndarray, range_: 
     beside = [(way, piece) for piece in inside if (way := _lies_beside(piece, whole, start, stop)) is not None]
     if beside:
         middle = sample_at(part, np.array([arc_length(part)[-1] / 2]))[0, :2]
-        return min(beside, key=lambda of: (of[0] == "against", np.linalg.norm(of[1][:, :2] - middle, axis=-1).min()))[1]
+
+        def rank(candidate: tuple[str, np.ndarray]) -> tuple[bool, float]:
+            """Pieces that run the centerline's way come first, then the nearest to its middle."""
+            way, piece = candidate
+            return way == "against", float(np.linalg.norm(piece[:, :2] - middle, axis=-1).min())
+
+        return min(beside, key=rank)[1]
     span = np.array([start, stop]) / arc_length(whole)[-1]
     return sample_at(line, np.linspace(span[0], span[1], 11) * arc_length(line)[-1])
 

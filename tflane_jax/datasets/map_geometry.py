@@ -237,14 +237,14 @@ def join_ends(lines: Sequence[np.ndarray]) -> list[np.ndarray]:
 
     if not lines:
         return []
-    # End 2 i is the start of line i, end 2 i + 1 its last point.
+    # End 2 i is the start of line i, end 2 i + 1 its last point: `end // 2` is the line, `end ^ 1` its other end.
     ends = np.concatenate([[line[0, :2], line[-1, :2]] for line in lines])
     pairs = KDTree(ends).query_pairs(SAME_END, output_type="ndarray")
     size = (len(ends), len(ends))
     node = connected_components(coo_array((np.ones(len(pairs)), tuple(pairs.T)), shape=size), directed=False)[1]
     partner: dict[int, int] = {}
-    for meeting in (np.flatnonzero(node == n).tolist() for n in np.flatnonzero(np.bincount(node) == 2)):
-        first, second = meeting
+    for pair in np.flatnonzero(np.bincount(node) == 2):
+        first, second = np.flatnonzero(node == pair).tolist()
         partner |= {first: second, second: first}
     chains, used = [], set()
     # From the open ends first: the lines that remain are on rings.
@@ -252,7 +252,9 @@ def join_ends(lines: Sequence[np.ndarray]) -> list[np.ndarray]:
         parts, end = [], start
         while end is not None and end // 2 not in used:
             used.add(end // 2)
-            line = lines[end // 2][:: -1 if end % 2 else 1]
+            line = lines[end // 2]
+            if end % 2:  # entered at its last point
+                line = line[::-1]
             parts.append(line if not parts else line[1:])
             end = partner.get(end ^ 1)
         if parts:

@@ -106,8 +106,10 @@ def _sample_frames(log: Log) -> np.ndarray:
     step = max(round((log.rate_hz or _RATE_HZ) / _RATE_HZ), 1)
     frames = [*moments, *range(moments[-1], len(log.timestamps_ns), step)]
     # Key frames need not be whole steps apart: the first step after one may be shorter or longer, by half at most.
-    for before, moment in zip([None, *moments], moments, strict=False):
-        frames += range(moment, -1 if before is None else before + step // 2, -step)
+    stop = -1
+    for moment in moments:
+        frames += range(moment, stop, -step)
+        stop = moment + step // 2
     return np.unique(frames)
 
 

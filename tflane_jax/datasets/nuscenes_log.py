@@ -172,26 +172,26 @@ def with_gaps(log: Log) -> Log:
     missing = np.clip(missing_frames(log.timestamps_ns), 0, _LONGEST_GAP)
     if not missing.any():
         return log
-    place = np.concatenate([[0], np.cumsum(missing + 1)])
-    number = np.arange(place[-1] + 1)
-    before = np.searchsorted(place, number, side="right") - 1
-    known, found = np.isin(number, place), log.tracks
+    frame = np.concatenate([[0], np.cumsum(missing + 1)])  # of each recorded frame: its number in the result
+    every = np.arange(frame[-1] + 1)
+    source = np.searchsorted(frame, every, side="right") - 1  # the recorded frame at or before each
+    recorded = np.isin(every, frame)
     tracks = replace(
-        found,
-        position=found.position[before],
-        yaw=found.yaw[before],
-        occluded=found.occluded[before],
-        valid=found.valid[before] & known[:, None],
+        log.tracks,
+        position=log.tracks.position[source],
+        yaw=log.tracks.yaw[source],
+        occluded=log.tracks.occluded[source],
+        valid=log.tracks.valid[source] & recorded[:, None],
     )
     first = log.timestamps_ns[0]
-    times = np.interp(number, place, (log.timestamps_ns - first).astype(float))
+    times = np.interp(every, frame, (log.timestamps_ns - first).astype(float))
     return replace(
         log,
         timestamps_ns=first + np.round(times).astype(np.int64),
-        global_from_ego=log.global_from_ego[before],
+        global_from_ego=log.global_from_ego[source],
         tracks=tracks,
         actors=tracks,
-        keyframes=tuple(replace(moment, track_frame=int(place[moment.track_frame])) for moment in log.keyframes),
+        keyframes=tuple(replace(moment, track_frame=int(frame[moment.track_frame])) for moment in log.keyframes),
     )
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from tflane_jax.datasets.plausible import first_twice, left_of
+from tflane_jax.datasets.plausible import area_between, first_twice
 from tflane_jax.errors import UserError
 from tflane_jax.files.fields import items, member
 from tflane_jax.files.openlane import (
@@ -112,7 +112,7 @@ def _check_lanes(
         raise UserError(f"{where}: {names.lane_lane}: {names.lanes}[{own[0]}] is its own successor: restore the file")
     for i, (left, right) in enumerate(zip(*(side or [] for side in sides), strict=True)):
         length = sum(float(line_lengths(line)) for line in (left, right)) / 2
-        if left_of(left, right) < -_SWAPPED * length:
+        if area_between(left, right) < -_SWAPPED * length:
             raise UserError(
                 f"{where}: {names.lanes}[{i}]: the left boundary is to the right of the right one, in driving direction"
             )

@@ -10,9 +10,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from tflane_jax.datasets.argoverse2_log import ANNOTATIONS, city_of, find_logs, logs_within
 from tflane_jax.datasets.argoverse2_poses import read_poses
@@ -25,6 +26,9 @@ from tflane_jax.datasets.nuscenes_tables import shared_tables
 from tflane_jax.errors import UserError
 from tflane_jax.files.fields import load_members, member, numbers
 from tflane_jax.files.openlane import info_files
+
+if TYPE_CHECKING:
+    from scipy.spatial import KDTree
 
 RADII = (5.0, 10.0, 20.0, 50.0)
 NEAR = 5.0
@@ -131,11 +135,21 @@ def _log_drive(folder: Path) -> DrivenPath:
 
 def frame_drives(dataset: IndexedExamples) -> list[DrivenPath]:
     """Return the drives of a dataset: the positions of its examples in their order."""
-    drives: dict[tuple[str, str], list[np.ndarray]] = {}
+    return [drive for drive, _ in _by_drive(dataset)]
+
+
+def _by_drive(dataset: IndexedExamples) -> list[tuple[DrivenPath, list[int]]]:
+    """Return each drive of a dataset with the indices of its examples, which are in the order of its positions."""
+    positions: dict[tuple[str, str], list[np.ndarray]] = {}
+    indices: dict[tuple[str, str], list[int]] = {}
     for index in range(len(dataset)):
         info = dataset.info(index)
-        drives.setdefault((info.scene, info.area), []).append(info.global_from_ego[:2, 3])
-    return [DrivenPath(scene, area, np.stack(where)) for (scene, area), where in drives.items()]
+        drive = info.scene, info.area
+        positions.setdefault(drive, []).append(info.global_from_ego[:2, 3])
+        indices.setdefault(drive, []).append(index)
+    return [
+        (DrivenPath(scene, area, np.stack(where)), indices[scene, area]) for (scene, area), where in positions.items()
+    ]
 
 
 @dataclass(frozen=True)
@@ -170,13 +184,10 @@ def nearness(train: Sequence[DrivenPath], dataset: IndexedExamples) -> Nearness:
 
     Raises UserError where one side has no frames.
     """
-    rows: dict[tuple[str, str], list[int]] = {}
-    for index in range(len(dataset)):
-        info = dataset.info(index)
-        rows.setdefault((info.scene, info.area), []).append(index)
-    found = overlap(train, frame_drives(dataset))
+    by_drive = _by_drive(dataset)
+    found = overlap(train, [drive for drive, _ in by_drive])
     distances, assumed = np.zeros(len(dataset)), np.zeros(len(dataset), bool)
-    for indices, apart, guess in zip(rows.values(), found.distances, found.assumed, strict=True):
+    for (_, indices), apart, guess in zip(by_drive, found.distances, found.assumed, strict=True):
         distances[indices], assumed[indices] = apart, guess
     return Nearness(distances, assumed)
 
@@ -222,6 +233,20 @@ class Overlap:
         return sorted(rows, key=lambda row: (-float(row["frames within 20 m"]), float(row["least m"])))[:count]
 
 
+class _TrainingFrames(NamedTuple):
+    """Frames of the training drives that may be in one area.
+
+    Attributes:
+        tree: of their positions.
+        drives: one after the other.
+        owner: (F,) number of each frame's drive.
+    """
+
+    tree: KDTree
+    drives: list[DrivenPath]
+    owner: Int[np.ndarray, " f"]
+
+
 def overlap(train: Sequence[DrivenPath], validation: Sequence[DrivenPath]) -> Overlap:
     """Compare positions within each city, see `DrivenPath.area`; raises UserError where one side has no drive."""
     from scipy.spatial import KDTree
@@ -230,23 +255,25 @@ def overlap(train: Sequence[DrivenPath], validation: Sequence[DrivenPath]) -> Ov
         if not sum(len(drive.positions) for drive in drives):
             raise UserError(f"the {what} split has no frames")
     validation = [drive for drive in validation if len(drive.positions)]
-    trees = {}
+    training: dict[str, _TrainingFrames] = {}
     for area in {drive.area for drive in validation}:
         drives = [drive for drive in train if len(drive.positions) and (not area or drive.area in (area, ""))]
         if drives:
             owner = np.repeat(np.arange(len(drives)), [len(drive.positions) for drive in drives])
-            trees[area] = KDTree(np.concatenate([drive.positions for drive in drives])), owner, drives
+            tree = KDTree(np.concatenate([drive.positions for drive in drives]))
+            training[area] = _TrainingFrames(tree, drives, owner)
     distances, assumed, nearest = [], [], []
     for drive in validation:
-        if drive.area not in trees:
+        if drive.area not in training:
             distances.append(np.full(len(drive.positions), np.inf))
             assumed.append(np.zeros(len(drive.positions), bool))
             nearest.append("-")
             continue
-        tree, owner, drives = trees[drive.area]
-        distance, index = tree.query(drive.positions)
+        frames = training[drive.area]
+        distance, index = frames.tree.query(drive.positions)
+        owner = frames.owner[index]
         distances.append(distance)
-        named = np.array([bool(drive.area and other.area) for other in drives])
-        assumed.append(~named[owner[index]])
-        nearest.append(drives[owner[index[distance.argmin()]]].name)
+        named = np.array([bool(drive.area and other.area) for other in frames.drives])
+        assumed.append(~named[owner])
+        nearest.append(frames.drives[owner[distance.argmin()]].name)
     return Overlap(tuple(drive.name for drive in validation), tuple(distances), tuple(assumed), tuple(nearest))

@@ -56,7 +56,10 @@ def check_motion(position: Float[np.ndarray, "f d"], times_ns: Int[np.ndarray, "
 
 
 def missing_frames(times_ns: Int[np.ndarray, " f"]) -> Int[np.ndarray, " f-1"]:
-    """Return how many frames are missing in each interval, by the median of all: some where it is 1.5 times as long."""
+    """Return how many frames are missing in each interval; one shorter than 1.5 times the median lacks none.
+
+    That is 0, or -1 for an interval of at most half the median.
+    """
     steps = np.diff(times_ns)
     return np.rint(steps / np.median(steps)).astype(int) - 1 if len(steps) else steps
 
@@ -98,8 +101,8 @@ def check_steps(line: Float[np.ndarray, "n d"], where: str) -> None:
         raise UserError(f"{where}: points {i} and {i + 1} are {metres[i] / 1e3:g} km apart: restore the file")
 
 
-def left_of(left: Float[np.ndarray, "n d"], right: Float[np.ndarray, "m d"]) -> float:
-    """Return by how much a left boundary lies to the left of the right one, in driving direction: the area between."""
+def area_between(left: Float[np.ndarray, "n d"], right: Float[np.ndarray, "m d"]) -> float:
+    """Return the area between two boundaries, m2; negative if the left one is to the right, in driving direction."""
     ring = np.concatenate([right, left[::-1]])[:, :2]
     x, y = (ring - ring[0]).T  # city coordinates are large
     return float((x * np.roll(y, -1) - np.roll(x, -1) * y).sum() / 2.0)
@@ -108,7 +111,11 @@ def left_of(left: Float[np.ndarray, "n d"], right: Float[np.ndarray, "m d"]) -> 
 def first_twice(names: Sequence[T]) -> T | None:
     """Return the first name that occurs twice, or None."""
     seen: set[T] = set()
-    return next((name for name in names if name in seen or seen.add(name)), None)
+    for name in names:
+        if name in seen:
+            return name
+        seen.add(name)
+    return None
 
 
 def check_distance(position: Float[np.ndarray, "n 3"], where: Sequence[str]) -> None:

@@ -56,7 +56,7 @@ class MapFile:
 
     @property
     def recorded(self) -> bool:
-        """Whether somebody drove here: the map is that of a log."""
+        """Whether the map is that of a log with key frames and tracks; GeoJSON and OpenLane-V2 give the map alone."""
         return self.kind not in ("geojson", "openlane_v2")
 
     def content(self) -> str:
@@ -68,7 +68,9 @@ class MapFile:
         self._check_recorded()
         if self.kind == "nuscenes":
             return read_scene(self.files[0].parent, self.name)
-        return load_log(self.files[0].parent) if self.kind == "argoverse2" else read_scene_file(self.files[0])
+        if self.kind == "argoverse2":
+            return load_log(self.files[0].parent)
+        return read_scene_file(self.files[0])
 
     def outline(self) -> LogOutline:
         """Read the key frames of the log, without map and boxes; raises UserError as `log` does."""
@@ -87,7 +89,9 @@ class MapFile:
         """Read the map; raise UserError if a file is missing or damaged."""
         if self.kind == "openlane_v2":
             return read_segment(self.files)
-        return read_lanes(self.files[0]) if not self.recorded else road_map_of(self.log())
+        if self.kind == "geojson":
+            return read_lanes(self.files[0])
+        return road_map_of(self.log())
 
 
 def content_of(maps: Collection[MapFile]) -> str:

@@ -151,9 +151,9 @@ class Streamed:
         if min(threads, processes) < 0 or ahead < 1:
             raise UserError(f"{self.config}: threads and processes must be at least 0, ahead at least 1")
         grain = _grain()
-        wanted = grain.MapDataset.range(count).map(_Load(self, requests, prepare))
+        examples = grain.MapDataset.range(count).map(_Load(self, requests, prepare))
         options = grain.ReadOptions(num_threads=threads, prefetch_buffer_size=ahead if threads else 0)
-        loaded = wanted.to_iter_dataset(options)
+        loaded = examples.to_iter_dataset(options)
         if processes:
             _mark_flags_as_parsed()
             loaded = loaded.mp_prefetch(grain.MultiprocessingOptions(num_workers=processes))

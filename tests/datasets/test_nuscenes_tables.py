@@ -277,9 +277,9 @@ def test_a_place_is_a_plain_name(tmp_path):
     content["log"][0]["location"] = "../secret"
     root = write_nuscenes(tmp_path, content)
     found = read_tables(root / "v1.0-mini")
-    with pytest.raises(UserError, match=r"row log-a: location is '\.\./secret', expected the name of a city"):
+    with pytest.raises(UserError, match=r"row log-a: location is '\.\./secret', expected a name that can be"):
         found.location(found.scenes()["scene-0061"])
-    with pytest.raises(UserError, match=r"location is '\.\./secret', expected the name of a city"):
+    with pytest.raises(UserError, match=r"location is '\.\./secret', expected a name that can be"):
         list(scene_files(root / "v1.0-mini" / "scene.json"))
 
 

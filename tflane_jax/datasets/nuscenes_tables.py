@@ -21,7 +21,7 @@ from tflane_jax.datasets.plausible import FARTHEST
 from tflane_jax.errors import UserError
 from tflane_jax.files.fields import numbers
 from tflane_jax.files.json_rows import json_rows
-from tflane_jax.files.wording import shown
+from tflane_jax.files.wording import file_name, shown
 from tflane_jax.geometry import matrix_from_quaternion, pose_matrix
 
 Row = Mapping[str, Any]
@@ -124,10 +124,7 @@ class Tables:
     def location(self, scene: Row) -> str:
         """Return the place where a scene was recorded, which names its map; raises UserError if it is no plain name."""
         token = scene["log_token"]
-        place = self.rows["log"][token]["location"]
-        if Path(place).name != place:
-            raise UserError(f"{self.where('log', token)}: location is {shown(place)}, expected the name of a city")
-        return place
+        return file_name(self.rows["log"][token]["location"], f"{self.where('log', token)}: location")
 
     def samples(self, scene: Row) -> list[Row]:
         """Return the samples (2 Hz key frames) of a scene in the order of time.

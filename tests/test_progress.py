@@ -1,9 +1,17 @@
 """Progress in a log: few whole lines, with rate and time left."""
 
+import sys
+
 import pytest
 
 from tflane_jax import progress
 from tflane_jax.progress import progress_bar
+
+
+@pytest.fixture(autouse=True)
+def no_notebook(monkeypatch):
+    """Whatever this process ran before, as the tests of notebooks, standard error is that of no notebook."""
+    monkeypatch.delitem(sys.modules, "ipykernel", raising=False)
 
 
 @pytest.fixture

@@ -11,6 +11,8 @@ from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import resource_tracker
 
+_SAFE_PATH = "PYTHONSAFEPATH"
+
 
 @contextlib.contextmanager
 def spared_interrupts() -> Iterator[None]:
@@ -27,6 +29,23 @@ def spared_interrupts() -> Iterator[None]:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+@contextlib.contextmanager
+def safe_path_for_children() -> Iterator[None]:
+    """Processes that start inside the block do not look for Python's own modules in the working directory.
+
+    They start as `python -c`, which puts that folder first, before they get the search path of this process.
+    """
+    before = os.environ.get(_SAFE_PATH)
+    os.environ[_SAFE_PATH] = "1"
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ[_SAFE_PATH]
+        else:
+            os.environ[_SAFE_PATH] = before
 
 
 def end_workers(pool: ProcessPoolExecutor) -> None:

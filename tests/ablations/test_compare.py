@@ -63,8 +63,15 @@ def test_a_configuration_that_cannot_be_sent_is_an_error_and_leaves_the_worker_f
 def test_runs_that_are_trained_anew_count_from_their_beginning(tmp_path, monkeypatch):
     """Regression: the bar showed the steps of the runs that were to be deleted."""
     jobs = [Job(CONFIG, tmp_path / name, retrain=True) for name in ("other", "same")]
+    starts = {"other": "overwrite", "same": "resume"}
+    monkeypatch.setattr(Job, "start", lambda job: starts[job.folder.name])
     monkeypatch.setattr(Job, "step", lambda job: 2)
-    assert workers._steps(jobs, {jobs[0].place}) == 2
+    anew = {job.place for job in jobs if job.start() == "overwrite"}
+    for begun in (jobs[1:], jobs):
+        assert workers._not_begun(anew, begun) == anew
+    assert workers._steps(jobs, anew) == 2
+    starts["other"] = "new"
+    assert workers._not_begun(anew, jobs) == set()
     assert workers._steps(jobs, set()) == 4
 
 

@@ -134,7 +134,7 @@ def test_tuples_that_hold_each_other_twice_are_refused(tmp_path, twice):
     """Hashing the last of fifty, the key of a mapping, would take years."""
     file = tmp_path / "key.pkl"
     file.write_bytes(b"\x80\x04})" + b"".join(map(twice, range(50))) + b"K\x01s.")
-    with pytest.raises(UserError, match=r"key\.pkl is .* damaged .*its tuples hold each other too many times"):
+    with pytest.raises(UserError, match=r"key\.pkl is .* damaged .*its tuples or sets hold each other too many times"):
         load_plain_pickle(file)
     file.write_bytes(b"\x80\x04})" + b"".join(map(twice, range(10))) + b"K\x01s.")
     assert list(load_plain_pickle(file).values()) == [1]

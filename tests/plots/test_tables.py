@@ -42,6 +42,7 @@ def test_cells_without_a_number(value, shown):
 def test_texts_of_files_control_no_terminal_and_make_no_lines():
     table = format_table([{"scene": "a\x1b[2J\n# b|c\r", "n": 1}])
     assert len(table.splitlines()) == 3
+    assert format_table([], title="a\x1b[2J\n\nb") == "a\\x1b[2J\n\nb"
     assert r"| a\x1b[2J # b\|c\r |" in table
 
 

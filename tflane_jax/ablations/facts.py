@@ -58,7 +58,7 @@ def mixed_hosts(rows: Sequence[TableRow], trained: Mapping[str, Sequence[Job]]) 
         if row.start:
             found[row.start].setdefault(job.seed, set()).add(facts(job).origins)
     for row, job in runs:
-        if row.name in found:  # it is the host itself
+        if found.get(row.name):  # it is the host itself, and rows start from it
             started, gives = found[row.name].get(job.seed, set()), given_hashes(job)
             if gives and not any(set(gives) & set(of_row) for of_row in started):
                 started.add(gives)

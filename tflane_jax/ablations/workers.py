@@ -22,7 +22,7 @@ from tflane_jax.ablations.jobs import Failure, Job
 from tflane_jax.ablations.reservations import Reservations
 from tflane_jax.ablations.scores import code_digest, is_measured, measure_all
 from tflane_jax.ablations.training_queue import Queue
-from tflane_jax.child_processes import end_with_parent, spared_interrupts
+from tflane_jax.child_processes import end_with_parent, safe_path_for_children, spared_interrupts
 from tflane_jax.config_io import first_difference
 from tflane_jax.errors import Interrupted, UserError
 from tflane_jax.files.wording import counted
@@ -149,7 +149,7 @@ def _train_in_workers(
             time.sleep(_POLL_SECONDS)
             bar.set_postfix_str(_running(workers, queue), refresh=False)
             begun = [*(worker.job for worker in workers if worker.job is not None), *queue.elsewhere]
-            anew -= {job.place for job in begun if job.start() != "overwrite"}
+            anew = _not_begun(anew, begun)
             bar.update(_steps(jobs, anew) - bar.n)
             for worker in workers:
                 if (done := worker.poll()) is None:
@@ -162,6 +162,11 @@ def _train_in_workers(
                         finished(done.job)
                 queue.done(done.job)
     return failures
+
+
+def _not_begun(anew: set[Path], begun: Sequence[Job]) -> set[Path]:
+    """Return the folders among those of runs that are trained anew which still hold the records of other runs."""
+    return anew - {job.place for job in begun if job.start() != "overwrite"}
 
 
 def _steps(jobs: Sequence[Job], anew: Collection[Path]) -> int:
@@ -216,7 +221,7 @@ class Worker:
         self._pipe, far = context.Pipe()
         given = far, self._cores, self._accelerator
         self._process: Any = context.Process(target=_train_jobs, args=given, daemon=True)
-        with huge_pages_for_children(), spared_interrupts():
+        with huge_pages_for_children(), safe_path_for_children(), spared_interrupts():
             self._process.start()
         far.close()  # so that reading fails, instead of waiting, once the process is gone
         self.tasks.clear()

@@ -18,7 +18,7 @@ from tflane_jax.datasets import sources
 from tflane_jax.datasets.base import SPLITS, IndexedExamples, spread
 from tflane_jax.datasets.batches import prepared
 from tflane_jax.datasets.overlap import has_official_splits, overlap, read_drives
-from tflane_jax.errors import UserError
+from tflane_jax.errors import UserError, printable
 from tflane_jax.files.wording import counted
 from tflane_jax.plots import dataset_summary, format_table, save_camera_views, save_contact_sheet, save_table
 from tflane_jax.plots.tables import written_to
@@ -130,7 +130,7 @@ def _print_list(title: str, texts: Sequence[str], *, every: bool) -> None:
     if not texts:
         return
     shown = texts if every else texts[:_PRINTED]
-    print(f"\n{title}:", *(f"  - {text}" for text in shown), sep="\n")
+    print(f"\n{title}:", *(f"  - {printable(text)}" for text in shown), sep="\n")
     if len(shown) < len(texts):
         print(f"  ... and {len(texts) - len(shown)} more: --all lists them")
 

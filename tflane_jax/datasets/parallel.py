@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tflane_jax.child_processes import end_with_parent, end_workers, spared_interrupts
+from tflane_jax.child_processes import end_with_parent, end_workers, safe_path_for_children, spared_interrupts
 from tflane_jax.datasets.base import IndexedExamples, made
 from tflane_jax.datasets.leaves import check_form, example_leaves
 from tflane_jax.errors import UserError
@@ -132,7 +132,7 @@ def _run(job: _Job, blocks: list[range], workers: int) -> Iterator[tuple[range, 
     with _environment(_WORKER_ENVIRONMENT):
         pool = ProcessPoolExecutor(workers, context, _start_worker, (job,))
         try:
-            with spared_interrupts():  # submitting starts the processes
+            with safe_path_for_children(), spared_interrupts():  # submitting starts the processes
                 futures = {pool.submit(_write_block, block): block for block in blocks}
             for future in as_completed(futures):
                 names, warned = future.result()

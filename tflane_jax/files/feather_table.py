@@ -13,8 +13,8 @@ from tflane_jax.errors import UserError, missing_extra
 Kind = Literal["integer", "number", "text"]
 """What a column holds: whole numbers (int64), finite numbers (float64), or text (str)."""
 _LONGEST_TEXT = 1000
-# Logs have up to some 50,000 rows.
-_MOST_ROWS, _MOST_BYTES = 10**7, 2**31
+# Files of a log have up to some 50,000 rows and a few MB. Those that are compressed unpack before rows are counted.
+_MOST_ROWS, _MOST_BYTES = 10**7, 2**28
 
 
 def read_columns(path: Path, columns: Mapping[str, Kind]) -> dict[str, np.ndarray]:
@@ -32,11 +32,11 @@ def read_columns(path: Path, columns: Mapping[str, Kind]) -> dict[str, np.ndarra
     if not path.is_file():
         raise UserError(f"{path} is missing: download it with the Argoverse 2 sensor dataset")
     try:
+        if path.stat().st_size > _MOST_BYTES:
+            raise UserError(f"{path} has {path.stat().st_size / 2**20:,.0f} MiB: it is no file of one log")
         table = feather.read_table(path)
-        if table.num_rows > _MOST_ROWS or table.nbytes > _MOST_BYTES:
-            raise UserError(
-                f"{path} has {table.num_rows:,} rows of {table.nbytes / 2**30:.3g} GiB: it is no file of one log"
-            )
+        if table.num_rows > _MOST_ROWS:
+            raise UserError(f"{path} has {table.num_rows:,} rows: it is no file of one log")
         # Of a damaged file, offsets and numbers of dictionary entries may point anywhere.
         table.validate(full=True)
     except (pyarrow.ArrowException, OSError) as error:

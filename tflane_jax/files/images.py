@@ -125,7 +125,8 @@ def read_image(path: Path) -> UInt8[np.ndarray, "h w 3"]:
             image = cv2.imdecode(data, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
     except cv2.error as error:
         if "MAX_IMAGE_PIXELS" in error.err:
-            most = f"{int(os.environ[_PIXELS]):,}"
+            most = os.environ[_PIXELS]
+            most = f"{int(most):,}" if most.isdecimal() else most
             raise UserError(f"{path} has more than {most} pixels: make it smaller, or set {_PIXELS}") from None
         raise UserError(f"cannot read the image {path}: {error.err}") from None
     if image is None or image.dtype not in (np.uint8, np.uint16):

@@ -121,7 +121,7 @@ def _check_instructions(file: IO[bytes]) -> None:
             raise pickle.UnpicklingError("it numbers its objects in an unknown way")
         sizes.follow(instruction, argument)
         if sizes.repeated > max(_MOST_REPEATED, _PER_INSTRUCTION * count):
-            raise pickle.UnpicklingError("its tuples hold each other too many times")
+            raise pickle.UnpicklingError("its tuples or sets hold each other too many times")
     file.seek(start)
 
 

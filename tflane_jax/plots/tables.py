@@ -31,6 +31,7 @@ def format_table(rows: Sequence[Row], columns: Sequence[str] | None = None, *, t
     Returns:
         The title alone if there is no column.
     """
+    title = printable(title, "\n")
     names = list(columns) if columns is not None else list(dict.fromkeys(name for row in rows for name in row))
     if not names:
         return title

@@ -90,8 +90,11 @@ def load_arrays(folder: Path) -> dict[str, np.ndarray]:
 def _check_memory(arrays: Sequence[tuple[Sequence[int], np.dtype]]) -> None:
     """Raise ValueError for arrays that this machine cannot hold: allocating them would end the process."""
     needed = sum(math.prod(shape) * dtype.itemsize for shape, dtype in arrays)
-    there = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else needed
-    if needed > there:
+    try:
+        page, pages = (os.sysconf(name) for name in ("SC_PAGE_SIZE", "SC_PHYS_PAGES"))
+    except (AttributeError, ValueError, OSError):  # this system does not tell
+        return
+    if page > 0 and pages > 0 and needed > (there := page * pages):
         raise ValueError(f"its arrays claim {needed / 2**30:.3g} GiB, this machine has {there / 2**30:.3g}")
 
 

@@ -29,7 +29,7 @@ def marker_bodies(markers: PlacedMarkers | None) -> Bodies:
     Args:
         markers: their poses; the ground is at z = 0, and a board lower than the thickness of a post has no post.
 
-    Raises UserError for a fraction outside 0 to 1, a size that is not positive, or ids outside the family.
+    Raises UserError for a size that is not positive, or ids outside the family.
     """
     if markers is None:
         return pack([], [])

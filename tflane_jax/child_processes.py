@@ -7,11 +7,15 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import resource_tracker
 
-_SAFE_PATH = "PYTHONSAFEPATH"
+SAFE_PATH = {"PYTHONSAFEPATH": "1"}
+"""With it, a child does not look for Python's own modules in the working directory.
+
+It starts as `python -c`, which puts that folder first until the child gets the search path of its parent.
+"""
 
 
 @contextlib.contextmanager
@@ -32,20 +36,18 @@ def spared_interrupts() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def safe_path_for_children() -> Iterator[None]:
-    """Processes that start inside the block do not look for Python's own modules in the working directory.
-
-    They start as `python -c`, which puts that folder first, before they get the search path of this process.
-    """
-    before = os.environ.get(_SAFE_PATH)
-    os.environ[_SAFE_PATH] = "1"
+def environment_of_children(values: Mapping[str, str]) -> Iterator[None]:
+    """Set environment variables, which child processes inherit, for as long as the block lasts."""
+    before = {name: os.environ.get(name) for name in values}
+    os.environ.update(values)
     try:
         yield
     finally:
-        if before is None:
-            del os.environ[_SAFE_PATH]
-        else:
-            os.environ[_SAFE_PATH] = before
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
 
 
 def end_workers(pool: ProcessPoolExecutor) -> None:

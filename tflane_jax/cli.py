@@ -81,7 +81,7 @@ def _run(arguments: Sequence[str]) -> int:
 
 
 def _check_filled(arguments: Sequence[str]) -> None:
-    """Raise UserError for an empty argument: as a path, it would be the working directory."""
+    """Raise UserError for an empty argument, which as a path would be the working directory, and for a comment's #."""
     for before, argument in itertools.pairwise(("tflane", *arguments)):
         if not argument or re.fullmatch("--[^=]+=", argument):
             place = f"{argument.removesuffix('=')} has an empty value" if argument else f"an empty word after {before}"

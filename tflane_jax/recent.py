@@ -1,6 +1,6 @@
-"""A thread-safe cache: each value is computed once, on first use.
+"""Thread-safe caches: the values asked for last, and values that are kept as long as an object.
 
-Only threads that ask for the same value wait while it is made.
+A value is made on first use, once. Only threads that ask for the same value wait meanwhile.
 """
 
 from __future__ import annotations

@@ -45,7 +45,7 @@ def save_effects(
             lines.append(f"Remark: {no_drives}: the intervals are too narrow.")
     rows, title = _rows(results, declared.declaration, test, tested), "\n".join(lines)
     meta = {"declaration": asdict(declared), "protocol": results.protocol(test), "seeds": list(seeds)}
-    meta["unit"] = FRACTIONS
+    meta |= {"unit": FRACTIONS}
     path, _ = save_table(stem, rows, meta, title=title, digits=4)
     print("\n" + format_table(rows, title=title, digits=4))
     return path

@@ -22,7 +22,7 @@ from tflane_jax.ablations.jobs import Failure, Job
 from tflane_jax.ablations.reservations import Reservations
 from tflane_jax.ablations.scores import code_digest, is_measured, measure_all
 from tflane_jax.ablations.training_queue import Queue
-from tflane_jax.child_processes import end_with_parent, safe_path_for_children, spared_interrupts
+from tflane_jax.child_processes import SAFE_PATH, end_with_parent, environment_of_children, spared_interrupts
 from tflane_jax.config_io import first_difference
 from tflane_jax.errors import Interrupted, UserError
 from tflane_jax.files.wording import counted
@@ -221,7 +221,7 @@ class Worker:
         self._pipe, far = context.Pipe()
         given = far, self._cores, self._accelerator
         self._process: Any = context.Process(target=_train_jobs, args=given, daemon=True)
-        with huge_pages_for_children(), safe_path_for_children(), spared_interrupts():
+        with huge_pages_for_children(), environment_of_children(SAFE_PATH), spared_interrupts():
             self._process.start()
         far.close()  # so that reading fails, instead of waiting, once the process is gone
         self.tasks.clear()

@@ -33,9 +33,9 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> int:
         raise UserError(f"--seeds {' '.join(map(str, options.seeds))}: the seeds must differ")
     if wrong := [seed for seed in options.seeds if not 0 <= seed <= LARGEST_SEED]:
         raise UserError(f"--seeds {wrong[0]}: a seed is a whole number from 0 to {LARGEST_SEED}")
-    if len(rows) > 1 and len(options.seeds) == 1 and (last := options.seeds[0]) > 0:
-        several = f"; for {last} seeds give --seeds {' '.join(map(str, range(last)))}" if last <= _MOST_MEANT else ""
-        print_notices([f"--seeds {last} is seed {last} alone, with which nothing can be tested{several}"])
+    if len(rows) > 1 and len(options.seeds) == 1 and (seed := options.seeds[0]) > 0:
+        several = f"; for {seed} seeds give --seeds {' '.join(map(str, range(seed)))}" if seed <= _MOST_MEANT else ""
+        print_notices([f"--seeds {seed} is seed {seed} alone, with which nothing can be tested{several}"])
     if options.jobs < 1:
         raise UserError(f"--jobs {options.jobs}: at least one training runs at a time")
     given = [*overrides, *(setting for _, _, settings in rows for setting in settings)]

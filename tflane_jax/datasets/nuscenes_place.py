@@ -42,7 +42,7 @@ def scene_files(scenes: Path) -> Iterator[tuple[str, tuple[Path, ...]]]:
         place = city.get(_text(row, "log_token", scenes))
         if place is None:
             raise UserError(f"{scenes}: scene {name} names a log that is not in {logs}")
-        file_name(place, f"{logs}: location")
+        place = file_name(place, f"{logs}: location")
         yield name, (scenes, *others, expansions / f"{place}.json")
 
 

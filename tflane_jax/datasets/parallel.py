@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import itertools
 import multiprocessing
-import os
 import warnings
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -20,7 +19,13 @@ from pathlib import Path
 
 import numpy as np
 
-from tflane_jax.child_processes import end_with_parent, end_workers, safe_path_for_children, spared_interrupts
+from tflane_jax.child_processes import (
+    SAFE_PATH,
+    end_with_parent,
+    end_workers,
+    environment_of_children,
+    spared_interrupts,
+)
 from tflane_jax.datasets.base import IndexedExamples, made
 from tflane_jax.datasets.leaves import check_form, example_leaves
 from tflane_jax.errors import UserError
@@ -36,7 +41,7 @@ _WORKER_ENVIRONMENT = {
     "OPENBLAS_NUM_THREADS": "1",
     "MKL_NUM_THREADS": "1",
     "JAX_PLATFORMS": "cpu",
-}
+} | SAFE_PATH
 
 
 def frame_leaves(dataset: IndexedExamples, index: int) -> tuple[dict[str, np.ndarray], str]:
@@ -129,10 +134,10 @@ def _run(job: _Job, blocks: list[range], workers: int) -> Iterator[tuple[range, 
         return
     # Not fork: jax runs threads, and a fork of a process with threads may deadlock.
     context = multiprocessing.get_context("spawn")
-    with _environment(_WORKER_ENVIRONMENT):
+    with environment_of_children(_WORKER_ENVIRONMENT):
         pool = ProcessPoolExecutor(workers, context, _start_worker, (job,))
         try:
-            with safe_path_for_children(), spared_interrupts():  # submitting starts the processes
+            with spared_interrupts():  # submitting starts the processes
                 futures = {pool.submit(_write_block, block): block for block in blocks}
             for future in as_completed(futures):
                 names, warned = future.result()
@@ -149,21 +154,6 @@ def _run(job: _Job, blocks: list[range], workers: int) -> Iterator[tuple[range, 
             raise
         finally:
             pool.shutdown(wait=True, cancel_futures=True)
-
-
-@contextlib.contextmanager
-def _environment(values: dict[str, str]) -> Iterator[None]:
-    """Set environment variables, which child processes inherit, for as long as the block lasts."""
-    before = {name: os.environ.get(name) for name in values}
-    os.environ.update(values)
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
 
 
 def _write_examples(job: _Job, indices: range) -> list[str]:

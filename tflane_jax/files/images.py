@@ -125,8 +125,8 @@ def read_image(path: Path) -> UInt8[np.ndarray, "h w 3"]:
             image = cv2.imdecode(data, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
     except cv2.error as error:
         if "MAX_IMAGE_PIXELS" in error.err:
-            most = os.environ[_PIXELS]
-            most = f"{int(most):,}" if most.isdecimal() else most
+            limit = os.environ[_PIXELS]  # OpenCV also takes texts such as 100Mb
+            most = f"{int(limit):,}" if limit.isdecimal() else limit
             raise UserError(f"{path} has more than {most} pixels: make it smaller, or set {_PIXELS}") from None
         raise UserError(f"cannot read the image {path}: {error.err}") from None
     if image is None or image.dtype not in (np.uint8, np.uint16):

@@ -65,7 +65,7 @@ def short_stem(path: Path) -> str:
 
 
 def file_name(value: Any, where: str) -> str:
-    """Return a name from which names of files are made: it leads to no other folder, and can be printed."""
+    """Return a name from which names of files are made; raises UserError if it leads elsewhere or cannot be printed."""
     plain = (
         isinstance(value, str) and value.isprintable() and not {"/", "\\"} & set(value) and value not in ("", ".", "..")
     )

@@ -157,14 +157,13 @@ def simulate_detections(
     seen = visible(true, config)
     if cameras is not None:
         seen[seen] = in_images(true[seen], markers.size, cameras)
+    mounts = config.cameras or ARGOVERSE2_RING
     if config.occlusion == "bodies":
         fraction = fraction_in_sight if config.cameras is None else seen_fraction
-        mounts = config.cameras or ARGOVERSE2_RING
         shown = fraction(log, moment, true[seen], markers.size, mounts, static_boxes(log))
         # A square outside all images is not seen, even where `least_seen` is 0.
         seen[seen] = (shown > 0.0) & (shown >= config.least_seen)
     elif config.cameras is not None:
-        mounts = config.cameras or ARGOVERSE2_RING
         seen[seen] = seen_fraction(log, moment, true[seen], markers.size, mounts, None) > 0.0
     if config.occlusion == "line_of_sight":
         seen[seen] = ~_hidden(log, moment, true[seen])

@@ -6,7 +6,7 @@ import pytest
 from tests.fakes import fake_segments
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.markers.detection import DetectedMarkers
-from tflane_jax.plots import cameras, marker_drive, style
+from tflane_jax.plots import marker_drive, projection, style
 from tflane_jax.priors.marker_memory import MarkerGuidance
 from tflane_jax.scene import CameraViews, LineClass, LinePrediction
 
@@ -119,7 +119,7 @@ def frame_with(prediction, folder, monkeypatch):
 
     monkeypatch.setattr(marker_drive, "save_figure", lambda figure, path: figures.append(figure))
     monkeypatch.setattr(marker_drive, "draw_projected", projected)
-    monkeypatch.setattr(cameras, "draw_projected", projected)
+    monkeypatch.setattr(projection, "draw_projected", projected)
     marker_drive.save_drive_frame(
         folder / "x.png", views, found, {98: "used"}, {98: 0.5}, NO_LANES, prediction, view=PerceptionRange()
     )

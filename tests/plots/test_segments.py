@@ -8,9 +8,10 @@ from tests.fakes import fake_example, fake_segments, fake_views
 from tests.plots.pictures import count_colours
 from tflane_jax.plots import Findings, save_camera_views, save_differences, save_examples, style
 from tflane_jax.plots.bev import draw_found, draw_prediction, draw_scene
-from tflane_jax.plots.cameras import draw_camera, draw_projected, legend_entries
+from tflane_jax.plots.cameras import draw_camera, legend_entries
 from tflane_jax.plots.figure import new_figure
 from tflane_jax.plots.legends import above_entries
+from tflane_jax.plots.projection import draw_projected
 from tflane_jax.plots.segments import (
     LINE_STYLES,
     boundary_types,

@@ -7,12 +7,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import PerceptionRange, invert_pose
-from tflane_jax.geometry.cameras import project
-from tflane_jax.geometry.polylines import resample_lines
 from tflane_jax.plots import style
 from tflane_jax.plots.bev import GROUND, VIEW, draw_found, draw_scene, truth_layers
 from tflane_jax.plots.figure import new_figure, save_figure
@@ -20,6 +18,13 @@ from tflane_jax.plots.images import draw_image
 from tflane_jax.plots.legends import above_entries, boundary_entries, truth_entry
 from tflane_jax.plots.lines import valid_rows
 from tflane_jax.plots.map_lines import chosen_lines, class_entries
+from tflane_jax.plots.projection import (
+    direction_colours,
+    draw_boxes,
+    draw_projected,
+    draw_projected_boundaries,
+    draw_projected_by_class,
+)
 from tflane_jax.plots.segments import boundary_types, chosen_areas, chosen_segments
 from tflane_jax.scene import (
     AreaType,
@@ -27,41 +32,16 @@ from tflane_jax.scene import (
     ElementPrediction,
     Example,
     LanePrediction,
-    LineClass,
     LinePrediction,
-    LineType,
+    MapLines,
     SegmentPrediction,
-    TrafficElements,
     row_of,
 )
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-ATTRIBUTE_NAMES = (
-    "?",
-    "red",
-    "green",
-    "yellow",
-    "straight",
-    "left",
-    "right",
-    "no left",
-    "no right",
-    "U-turn",
-    "no U-turn",
-    "slight left",
-    "slight right",
-)
-"""Short names of OpenLane-V2's attributes of traffic elements, by number."""
-
 _PANEL = 3.4  # inches
-# Points on a lane in an image: less than half a metre apart on the longest lanes.
-_POINTS = 201
-# Length of a dash and of dash with gap, metres; None: no gaps.
-_DASHES = {LineType.NONE: (0.5, 2.0), LineType.SOLID: None, LineType.DASHED: (2.5, 5.0)}
-# Lanes are cut off at this depth, metres.
-_NEAR = 0.5
 # Entries of a legend in a row, and the height of a row, inches.
 _ENTRIES, _ROW = 7, 0.16
 # Images smaller than this are shown with sharp pixels.
@@ -172,81 +152,41 @@ def draw_camera(
     draw_image(ax, np.asarray(views.image)[number, :height, :width], _heading(views, number))
     if max(width, height) < _PIXELATED:
         ax.images[-1].set_interpolation("nearest")
-    predicted = lanes is not None or elements is not None
-    if isinstance(lanes, SegmentPrediction):
-        _draw_segments(ax, views, number, lanes, threshold)
-    elif isinstance(lanes, LinePrediction):
-        if example.map_lines is not None:
-            known = np.asarray(example.map_lines.points)[np.asarray(example.map_lines.valid)]
-            draw_projected(ax, views, number, known, colour="white", width=0.6)
-        points, category, _ = chosen_lines(lanes, threshold)
-        draw_projected_by_class(ax, views, number, points, category)
-    elif lanes is not None:
-        draw_projected(ax, views, number, np.asarray(lanes.points)[np.asarray(lanes.scores) >= threshold])
-    elif not predicted and example.map_lines is not None:
-        points, category = valid_rows(example.map_lines.valid, example.map_lines.points, example.map_lines.category)
-        draw_projected_by_class(ax, views, number, points, category)
-    elif not predicted:
-        draw_projected(ax, views, number, np.asarray(example.lanes.points)[np.asarray(example.lanes.valid)])
+    if lanes is not None:
+        _draw_predicted_lanes(ax, views, number, lanes, example.map_lines, threshold)
     if number == 0 and elements is not None:
         attribute, shown = np.asarray(elements.logits).argmax(-1), np.asarray(elements.scores) >= threshold
         draw_boxes(ax, np.asarray(elements.box), attribute, shown)
-    elif number == 0 and not predicted and example.traffic_elements is not None:
-        truth: TrafficElements = example.traffic_elements
-        draw_boxes(ax, np.asarray(truth.box), np.asarray(truth.attribute), np.asarray(truth.valid))
+    if lanes is None and elements is None:
+        _draw_truth(ax, views, number, example)
 
 
-def draw_projected(
-    ax: Axes,
-    views: CameraViews,
-    number: int,
-    lines: Float[np.ndarray, "n p 3"],
-    *,
-    colour: str | None = None,
-    width: float = 1.3,
-    dash: tuple[float, float] | None = None,
+def _draw_predicted_lanes(
+    ax: Axes, views: CameraViews, number: int, lanes: LanePrediction, truth: MapLines | None, threshold: float
 ) -> None:
-    """Draw lines of the ego frame into a camera's image.
-
-    Args:
-        ax, views, number: where, and which camera.
-        lines: metres.
-        colour: of all lines; None: by direction, ahead green, left blue, back magenta, right orange.
-        width: of the lines, points.
-        dash: length of a dash and of dash with gap on the ground, metres; None draws whole lines.
-    """
-    from matplotlib.collections import LineCollection
-
-    if not len(lines):
-        return
-    dense = resample_lines(list(np.asarray(lines, np.float64)), _POINTS)
-    columns, height = np.asarray(views.size)[number]
-    pixels, depth, _ = project(
-        dense.reshape(-1, 3),
-        np.asarray(views.intrinsics, np.float64)[number],
-        np.asarray(views.camera_from_ego, np.float64)[number],
-    )
-    pixels, depth = pixels.reshape(*dense.shape[:2], 2), depth.reshape(dense.shape[:2])
-    margin = 0.1 * max(columns, height)
-    shown = (depth > _NEAR) & ((pixels > -margin) & (pixels < [columns + margin, height + margin])).all(-1)
-    step = np.diff(dense[..., :2], axis=1)
-    pieces = shown[:, 1:] & shown[:, :-1]
-    if dash is not None:
-        along = np.cumsum(np.linalg.norm(step, axis=-1), axis=1)
-        pieces &= along % dash[1] < dash[0]
-    colours = colour or _direction_colours(np.arctan2(step[..., 1], step[..., 0]))[pieces]
-    parts = np.stack([pixels[:, :-1], pixels[:, 1:]], 2)[pieces]
-    ax.add_collection(LineCollection(list(parts), colors=colours, linewidths=width, alpha=0.85, zorder=2.0))
+    """Draw predicted lanes, segments or map lines; behind map lines, the true ones thin and white."""
+    if isinstance(lanes, SegmentPrediction):
+        _draw_segments(ax, views, number, lanes, threshold)
+    elif isinstance(lanes, LinePrediction):
+        if truth is not None:
+            known = np.asarray(truth.points)[np.asarray(truth.valid)]
+            draw_projected(ax, views, number, known, colour="white", width=0.6)
+        points, category, _ = chosen_lines(lanes, threshold)
+        draw_projected_by_class(ax, views, number, points, category)
+    else:
+        draw_projected(ax, views, number, np.asarray(lanes.points)[np.asarray(lanes.scores) >= threshold])
 
 
-def draw_projected_boundaries(
-    ax: Axes, views: CameraViews, number: int, lines: Float[np.ndarray, "n p 3"], types: Int[np.ndarray, " n"]
-) -> None:
-    """Draw boundaries into a camera's image by `LineType`: solid, dashed, or dotted and thin for none."""
-    for kind, dash in _DASHES.items():
-        width = 0.9 if kind == LineType.NONE else 1.3
-        mine = lines[np.asarray(types) == kind]
-        draw_projected(ax, views, number, mine, colour=style.PREDICTION, width=width, dash=dash)
+def _draw_truth(ax: Axes, views: CameraViews, number: int, example: Example) -> None:
+    """Draw the map lines of an example, or its lanes where it has none; in camera 0 the traffic elements, too."""
+    lines, elements = example.map_lines, example.traffic_elements
+    if lines is not None:
+        points, category = valid_rows(lines.valid, lines.points, lines.category)
+        draw_projected_by_class(ax, views, number, points, category)
+    else:
+        draw_projected(ax, views, number, np.asarray(example.lanes.points)[np.asarray(example.lanes.valid)])
+    if number == 0 and elements is not None:
+        draw_boxes(ax, np.asarray(elements.box), np.asarray(elements.attribute), np.asarray(elements.valid))
 
 
 def _draw_segments(ax: Axes, views: CameraViews, number: int, found: SegmentPrediction, threshold: float) -> None:
@@ -261,28 +201,6 @@ def _draw_segments(ax: Axes, views: CameraViews, number: int, found: SegmentPred
     draw_projected(ax, views, number, closed, colour=style.CROSSING, width=1.5)
     kerbs, _ = chosen_areas(found, threshold, AreaType.ROAD_BOUNDARY)
     draw_projected(ax, views, number, kerbs, colour=style.ROAD_BOUNDARY, width=1.5)
-
-
-def draw_projected_by_class(
-    ax: Axes, views: CameraViews, number: int, points: Float[np.ndarray, "n p 3"], category: Int[np.ndarray, " n"]
-) -> None:
-    """Draw lines of a vector map into a camera's image, in the colours of their classes."""
-    for kind, colour in style.MAP_LINE.items():
-        width = 0.8 if kind == LineClass.CENTERLINE else 1.5
-        draw_projected(ax, views, number, points[category == kind], colour=colour, width=width)
-
-
-def draw_boxes(
-    ax: Axes, box: Float[np.ndarray, "e 2 2"], attribute: Int[np.ndarray, " e"], chosen: Bool[np.ndarray, " e"]
-) -> None:
-    """Draw boxes of traffic elements (pixels) with the names of their attributes."""
-    from matplotlib.patches import Rectangle
-
-    for (low, high), shows in zip(box[chosen], attribute[chosen].tolist(), strict=True):
-        colour = style.LIGHT.get(shows, style.PREDICTION)
-        ax.add_patch(Rectangle(low, *(high - low), fill=False, edgecolor=colour, linewidth=1.0, zorder=3.0))
-        label = ATTRIBUTE_NAMES[shows]
-        ax.text(low[0], low[1], label, color=colour, fontsize=5, va="bottom", ha="left", clip_on=True, zorder=3.1)
 
 
 def _draw_above(
@@ -311,7 +229,7 @@ def legend_entries(lanes: LanePrediction | None) -> list:
     if isinstance(lanes, LinePrediction):
         return [*class_entries(), truth_entry()]
     names = ("lane ahead", "to the left", "back", "to the right")
-    colours = _direction_colours(np.array([0.0, 0.5, 1.0, -0.5]) * np.pi)
+    colours = direction_colours(np.array([0.0, 0.5, 1.0, -0.5]) * np.pi)
     ways = [Line2D([], [], color=colour, lw=1.5, label=name) for colour, name in zip(colours, names, strict=True)]
     return [*boundary_entries(style.PREDICTION), *ways] if isinstance(lanes, SegmentPrediction) else ways
 
@@ -336,10 +254,3 @@ def _heading(views: CameraViews, number: int) -> str:
     if abs(degrees) <= 2:
         return "ahead"
     return "back" if abs(degrees) >= 178 else f"{abs(degrees)}° {'left' if degrees > 0 else 'right'}"
-
-
-def _direction_colours(angle: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n 3"]:
-    from matplotlib.colors import hsv_to_rgb
-
-    hue = (angle / (2.0 * np.pi) + 1.0 / 3.0) % 1.0
-    return hsv_to_rgb(np.stack([hue, np.full_like(hue, 0.75), np.ones_like(hue)], -1))

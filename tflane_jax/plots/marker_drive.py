@@ -16,11 +16,11 @@ from tflane_jax.markers.observe import Outcome
 from tflane_jax.markers.square_pose import marker_outline
 from tflane_jax.plots import style
 from tflane_jax.plots.bev import draw_ego, draw_prediction, prepare
-from tflane_jax.plots.cameras import draw_projected, draw_projected_by_class
 from tflane_jax.plots.figure import new_figure, save_figure
 from tflane_jax.plots.images import draw_image
 from tflane_jax.plots.lines import add_arrows, add_lines
 from tflane_jax.plots.map_lines import chosen_lines, class_entries
+from tflane_jax.plots.projection import draw_projected, draw_projected_by_class
 from tflane_jax.plots.segments import chosen_segments
 from tflane_jax.priors.marker_memory import MarkerGuidance
 from tflane_jax.scene import CameraViews, LanePrediction, LinePrediction, SegmentPrediction

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
@@ -68,7 +69,8 @@ def check_openlane_v2(
 
     Raises UserError where there is no frame at all, or `tracks` holds no log.
     """
-    root, faults, skipped = Path(root), [], []
+    checks = _Checks(Path(root), tracks, images, cameras, progress)
+    root, faults, skipped = checks.root, checks.faults, checks.skipped
     if not root.is_dir():
         raise UserError(f"there is no folder {root}: name OpenLane-V2's")
     on_disk = frames_on_disk(root, skipped)
@@ -82,41 +84,99 @@ def check_openlane_v2(
         every = sorted({*named[split], *on_disk[split]}, key=lambda key: (key.segment, int(key.timestamp)))
         for subset in present:
             keys = [key for key in every if subsets.get((key.split, key.segment), present[0]) == subset]
-            found = len(faults)
-            if wrong := {key for key in keys if not has_time(key, subset)}:
-                faults.append(f"{root}: {len(wrong)} {split} frames, first {min(wrong)}: it {no_time(subset)}")
-                keys = [key for key in keys if key not in wrong]
+            before = len(faults)
+            keys = checks.with_time(split, subset, keys)
             if not keys:
                 continue
-            absent = set(named[split]).intersection(keys) - set(on_disk[split])
-            if absent:
-                faults.append(
-                    f"{root}: {len(absent)} of {len(keys)} {split} frames that split files name are missing (first "
-                    f"{min(absent)})"
-                )
-            there = [key for key in keys if key not in absent]
-            logs, unnamed = None, {}
-            if tracks is not None:
-                logs, unnamed = _logs(root, there, subset, tracks, alone=len(present) == 1)
-            counts = _check_frames(root, there, subset, logs, CameraChecks(images), cameras, faults, progress)
-            # What makes a file unreadable has been reported.
-            faults += [why for path, why in unnamed.items() if not any(str(path) in fault for fault in faults[found:])]
-            counts["segments"] = len({key.segment for key in there})
-            counts["SD maps"] = _check_sd_maps(root, there, faults)
-            content = counts if tracks is None else _with_share(counts)
-            lacking = Counter() if logs is None else logs.lacking(there)
-            del lacking[_NO_LOG]  # a fault
-            if lacking:
-                skipped.append(
-                    f"{lacking.total()} of {len(there)} {split} frames have no log in {tracks}, so no traffic flow: "
-                    f"it lacks {listed(lacking, len(lacking))}"
-                )
+            there = checks.not_absent(split, keys, set(named[split]) - set(on_disk[split]))
+            counts = checks.split(split, subset, there, alone=len(present) == 1)
             both = {"subset": subset} if len(present) > 1 else {}
-            rows.append({"split": split, **both, **content, "faults": len(faults) - found})
+            rows.append({"split": split, **both, **counts, "faults": len(faults) - before})
     skipped += _not_named(root, named, on_disk, present)
     of_collections, not_read = check_collections(root, [key for keys in on_disk.values() for key in keys])
     title = f"OpenLane-V2, subset {' and '.join(present)}"
     return FolderCheck(title, rows, [*faults, *of_collections], [*skipped, *not_read])
+
+
+@dataclass
+class _Checks:
+    """What to check, see `check_openlane_v2`, and what was found so far."""
+
+    root: Path
+    tracks: Path | None
+    images: Images
+    cameras: Literal["all", "some"]
+    progress: bool
+    faults: list[str] = field(default_factory=list)
+    skipped: list[str] = field(default_factory=list)
+
+    def with_time(self, split: Split, subset: SubsetName, keys: list[FrameKey]) -> list[FrameKey]:
+        """Return the frames whose names are times; the others are a fault."""
+        wrong = {key for key in keys if not has_time(key, subset)}
+        if wrong:
+            self.faults.append(f"{self.root}: {len(wrong)} {split} frames, first {min(wrong)}: it {no_time(subset)}")
+        return [key for key in keys if key not in wrong]
+
+    def not_absent(self, split: Split, keys: list[FrameKey], not_on_disk: set[FrameKey]) -> list[FrameKey]:
+        """Return the frames that are there; that the others are missing is a fault."""
+        absent = not_on_disk.intersection(keys)
+        if absent:
+            self.faults.append(
+                f"{self.root}: {len(absent)} of {len(keys)} {split} frames that split files name are missing (first "
+                f"{min(absent)})"
+            )
+        return [key for key in keys if key not in absent]
+
+    def split(self, split: Split, subset: SubsetName, keys: list[FrameKey], *, alone: bool) -> dict[str, Any]:
+        """Check the frames, logs and SD maps of a split and return the counts; `alone`: there is no other subset."""
+        before = len(self.faults)
+        logs, unnamed = None, {}
+        if self.tracks is not None:
+            logs, unnamed = _logs(self.root, keys, subset, self.tracks, alone=alone)
+        counts = self.frames(keys, subset, logs)
+        # What makes a file unreadable has been reported.
+        told = self.faults[before:]
+        self.faults += [why for path, why in unnamed.items() if not any(str(path) in fault for fault in told)]
+        counts["segments"] = len({key.segment for key in keys})
+        counts["SD maps"] = _check_sd_maps(self.root, keys, self.faults)
+        lacking = Counter() if logs is None else logs.lacking(keys)
+        del lacking[_NO_LOG]  # a fault
+        if lacking:
+            self.skipped.append(
+                f"{lacking.total()} of {len(keys)} {split} frames have no log in {self.tracks}, so no traffic flow: "
+                f"it lacks {listed(lacking, len(lacking))}"
+            )
+        return dict(counts) if self.tracks is None else _with_share(counts)
+
+    def frames(self, keys: list[FrameKey], subset: SubsetName, logs: SourceTracks | None) -> Counter[str]:
+        """Check frames that are there, in the order of time, and return what they hold."""
+        of_logs = () if logs is None else (_WITH_LOG, _WITHOUT_LOG, _WITH_TRAFFIC)
+        counts: Counter[str] = Counter(dict.fromkeys((*_COUNTS, *of_logs), 0))
+        images = CameraChecks(self.images)
+        before = None
+        lacking: dict[tuple[str, str], list[FrameKey]] = {}
+        title = f"checking {keys[0].split if keys else ''}"
+        for key in progress_bar(keys, title, unit="frame", disable=not self.progress):
+            frame = _check_frame(self.root, key, subset, counts, self.faults, images)
+            self.faults += _check_motion(before, key, frame, subset)
+            if frame is None:
+                continue
+            if logs is not None:
+                # A log that cannot be read is one fault, not one of each of its frames.
+                of_log = _check_tracks(logs, key, frame, counts)
+                self.faults += [fault for fault in of_log if fault not in self.faults]
+            for name, camera in zip(SUBSETS[subset].cameras, frame.cameras, strict=True):
+                if camera is None and self.cameras == "all":
+                    lacking.setdefault((key.scene, name), []).append(key)
+            before = (key, frame)
+        strange, of_cameras = images.finish()
+        counts["images"] -= strange
+        self.faults += of_cameras
+        self.faults += [
+            f"{self.root / scene}: {len(of)} frames have no camera {name} (first {of[0]})"
+            for (scene, name), of in lacking.items()
+        ]
+        return counts
 
 
 def _not_named(
@@ -134,43 +194,6 @@ def _not_named(
                 f"{len(unnamed)} of {len(keys)} {split} frames are named by no split file (first {unnamed[0]}): a "
                 "training does not see them, unless data.data_dict is folders"
             )
-
-
-def _check_frames(
-    root: Path,
-    keys: list[FrameKey],
-    subset: SubsetName,
-    logs: SourceTracks | None,
-    images: CameraChecks,
-    cameras: Literal["all", "some"],
-    faults: list[str],
-    progress: bool,
-) -> Counter[str]:
-    """Check frames that are there, in the order of time, and return what they hold."""
-    of_logs = () if logs is None else (_WITH_LOG, _WITHOUT_LOG, _WITH_TRAFFIC)
-    counts: Counter[str] = Counter(dict.fromkeys((*_COUNTS, *of_logs), 0))
-    before = None
-    lacking: dict[tuple[str, str], list[FrameKey]] = {}
-    for key in progress_bar(keys, f"checking {keys[0].split if keys else ''}", unit="frame", disable=not progress):
-        frame = _check_frame(root, key, subset, counts, faults, images)
-        faults += _check_motion(before, key, frame, subset)
-        if frame is None:
-            continue
-        if logs is not None:
-            # A log that cannot be read is one fault, not one of each of its frames.
-            faults += [fault for fault in _check_tracks(logs, key, frame, counts) if fault not in faults]
-        for name, camera in zip(SUBSETS[subset].cameras, frame.cameras, strict=True):
-            if camera is None and cameras == "all":
-                lacking.setdefault((key.scene, name), []).append(key)
-        before = (key, frame)
-    strange, of_cameras = images.finish()
-    counts["images"] -= strange
-    faults += of_cameras
-    faults += [
-        f"{root / scene}: {len(of)} frames have no camera {name} (first {of[0]})"
-        for (scene, name), of in lacking.items()
-    ]
-    return counts
 
 
 def _check_frame(

@@ -99,5 +99,5 @@ def quick(config):
     return replace(config, training=training, evaluation=replace(config.evaluation, pictures=0))
 
 
-def _compare_here(compare, *arguments, jobs, **options):
+def _compare_here(compare, *arguments, parallel, **options):
     return compare(*arguments, **options)

@@ -60,7 +60,7 @@ def _short(config: RunConfig) -> RunConfig:
 def main(out: Path) -> int:
     """Run the demo into a folder; finished runs in it are used."""
     print(_INTRODUCTION)
-    compare(configs(), (0,), out, jobs=2, summary=summary)
+    compare(configs(), (0,), out, parallel=2, summary=summary)
     print(f"\nWhere the two differ, with the lanes that only one of them finds: {out / 'comparison.png'}")
     print(f"With eight seeds and controls, hours on two cores (docs/tf_lane_results.md has them):\n\n{EXPERIMENT}")
     return 0

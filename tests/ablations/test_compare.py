@@ -122,7 +122,7 @@ def test_two_workers_train_all_runs_and_name_the_one_that_failed(tmp_path, monke
     other = dataclasses.replace(BASELINE, decoder=dataclasses.replace(BASELINE.decoder, queries=5))
     configs = {"one": CONFIG, "other": dataclasses.replace(CONFIG, task=LaneGraphTask(other))}
     out = tmp_path / "comparison"
-    compare(configs, (0, 1, 2), out, jobs=2)
+    compare(configs, (0, 1, 2), out, parallel=2)
     scores = json.loads((out / "scores.json").read_text())
     assert {name: len(values) for name, values in scores.items()} == {"one": 3, "other": 3}
     assert len(list(out.glob("*/seed_*/config.json"))) == len(list(out.glob("*/seed_*.log"))) == 6
@@ -133,12 +133,12 @@ def test_two_workers_train_all_runs_and_name_the_one_that_failed(tmp_path, monke
     (out / "one" / "seed_1.scores.json").unlink()
     with monkeypatch.context() as patch:
         patch.setattr(LaneGraphTask, "evaluate", None)  # of this process
-        compare(configs, (0, 1, 2), out, jobs=2)
+        compare(configs, (0, 1, 2), out, parallel=2)
     assert json.loads((out / "scores.json").read_text()) == scores
 
     broken = {"one": dataclasses.replace(CONFIG, optim=OptimConfig(warmup_steps=1000))}
     with pytest.raises(UserError, match=r"one: optim\.warmup_steps is 1000"):
-        compare(broken, (0, 1), tmp_path / "broken", jobs=2)
+        compare(broken, (0, 1), tmp_path / "broken", parallel=2)
     assert not (tmp_path / "broken").exists()
 
 

@@ -64,7 +64,7 @@ if __name__ == "__main__":
         seeds=2,
     )
     configure_jax()
-    run_table(table, range(2), Path(out), jobs=2)
+    run_table(table, range(2), Path(out), parallel=2)
 """
 
 

@@ -159,7 +159,7 @@ def test_a_table_that_was_stopped_ends_with_the_same_bytes(tiny, tmp_path, monke
 def test_fewer_seeds_are_an_interim_look_and_equal_rows_are_trained_once(tiny, tmp_path):
     rows = (TableRow("base", f"{tiny}:baseline"), TableRow("tfm", str(tiny)), TableRow("same", str(tiny)))
     table = small(tiny, rows=rows, seeds=3)
-    run_table(table, range(2), tmp_path, jobs=1)
+    run_table(table, range(2), tmp_path, parallel=1)
     assert len(list((tmp_path / "runs").glob("*/config.json"))) == 4
     assert "**Interim**: 2 of 3 declared seeds (0, 1)." in (tmp_path / "paper.9" / "effects.md").read_text()
     run_table(table, range(3), tmp_path)

@@ -100,7 +100,7 @@ def carry_over(settings: Settings, out: Path) -> Path:
     check(declaration, configs)
     untrained = plan_without_trainings(settings)
     content = {**untrained.content, **({} if settings.folds is None else {"folds": str(settings.folds)})}
-    plan = with_trainings(untrained, settings, configs, out, worker_threads(settings.jobs, settings.cores))
+    plan = with_trainings(untrained, settings, configs, out, worker_threads(settings.parallel, settings.cores))
     by_row = plan.by_row()
     check_rows(by_row)
     declared = declare(declaration, by_row, configs, settings.seeds, out, logs=plan.logs, content=content)
@@ -109,7 +109,7 @@ def carry_over(settings: Settings, out: Path) -> Path:
     basis = "a guess" if guesses else "by the runs so far"
     print(
         f"{counted(len(plan.flat()), 'run')}, {complete} complete; the others take about "
-        f"{seconds / 3600 / settings.jobs:.1f} h ({settings.jobs} at a time; {basis})",
+        f"{seconds / 3600 / settings.parallel:.1f} h ({settings.parallel} at a time; {basis})",
         flush=True,
     )
 
@@ -118,7 +118,7 @@ def carry_over(settings: Settings, out: Path) -> Path:
 
     for line in runs_elsewhere(plan.flat(), out / "runs", replan):
         print(line, flush=True)
-    failures = train_all(plan.flat(), settings.jobs, settings.cores)
+    failures = train_all(plan.flat(), settings.parallel, settings.cores)
     found, seeds, protocol = _evaluated(plan, failures)
     if not found:
         raise UserError(summary_of(failures, len(plan.flat())))

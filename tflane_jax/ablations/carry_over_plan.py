@@ -47,7 +47,7 @@ class Settings:
         steps, scenes: updates and training scenes of each run; None for those of the configurations.
         folds: number of groups into which all logs of the folder are divided; a training leaves a whole group out. None
             leaves each log out alone, which costs more trainings and leaves more maps in each.
-        jobs: trainings at a time.
+        parallel: trainings at a time.
         cores: of each training; None shares all between the trainings.
         quick: few updates on few scenes: a smoke test, no result.
     """
@@ -59,7 +59,7 @@ class Settings:
     steps: int | None = None
     scenes: int | None = None
     folds: int | None = None
-    jobs: int = 1
+    parallel: int = 1
     cores: int | None = None
     quick: bool = False
 

@@ -41,7 +41,7 @@ def compare(
     seeds: Sequence[int],
     out: Path,
     *,
-    jobs: int = 1,
+    parallel: int = 1,
     tests: Tests | None = None,
     retrain: bool = False,
     declaration: Declaration | None = None,
@@ -58,7 +58,7 @@ def compare(
         configs: by the name that the table shows; the first one is the control.
         seeds: of training; each configuration is trained with each.
         out: folder for everything.
-        jobs: trainings at a time, each on as many cores as the others.
+        parallel: trainings at a time, each on as many cores as the others.
         tests: further test sets by name: settings, `--data.name value`, that differ from the own test split.
         retrain: whether runs of other configurations in the folders are deleted and trained anew.
         declaration: what is tested. It is written to `declaration.json` before the trainings, and the report gets a
@@ -80,13 +80,13 @@ def compare(
     print_notices(_chosen_on_test(configs))
     if declaration is not None:
         check(declaration, configs)
-    plan = plan_jobs(configs, seeds, out, threads=worker_threads(jobs), tests=tests, retrain=retrain)
+    plan = plan_jobs(configs, seeds, out, threads=worker_threads(parallel), tests=tests, retrain=retrain)
     check_rows(plan)
     declared = None if declaration is None else declare(declaration, plan, configs, seeds, out)
     # Seed by seed, so that a comparison stopped early has pairs.
     every = [plan[name][i] for i in range(len(seeds)) for name in plan]
     results = Results(tuple(configs), tuple(seeds), tests)
-    trained, failures = train_and_evaluate(plan, every, results, jobs)
+    trained, failures = train_and_evaluate(plan, every, results, parallel)
     written = [save_plan(plan, failures, results, out)]
     if not results.scores:
         raise UserError(summary_of(failures, len(every)))

@@ -24,7 +24,7 @@ from tflane_jax.training.provenance import read_provenance
 
 
 def train_and_evaluate(
-    plan: Mapping[str, Sequence[Job]], order: Sequence[Job], results: Results, jobs: int
+    plan: Mapping[str, Sequence[Job]], order: Sequence[Job], results: Results, parallel: int
 ) -> tuple[dict[str, list[Job]], list[Failure]]:
     """Train what is missing, and add the scores of all runs, and why models failed, to the results.
 
@@ -32,12 +32,12 @@ def train_and_evaluate(
         plan: trainings of each model.
         order: of these trainings, and of those that they start from.
         results: without scores; changed.
-        jobs: trainings at a time.
+        parallel: trainings at a time.
 
     Returns:
         The runs that were trained and evaluated, and the failures of the others.
     """
-    return evaluate_and_note(plan, train_all(order, jobs), results)
+    return evaluate_and_note(plan, train_all(order, parallel), results)
 
 
 def evaluate_and_note(

@@ -30,13 +30,15 @@ from tflane_jax.training.records import read_records
 AT_THE_EDGE = "at the edge of the grid: a wider search may find a better one"
 
 
-def search_rates(table: PaperTable, out: Path, *, jobs: int = 1, cores: int | None = None, quick: bool = False) -> Path:
+def search_rates(
+    table: PaperTable, out: Path, *, parallel: int = 1, cores: int | None = None, quick: bool = False
+) -> Path:
     """Train what is missing, and write and print the score of every rate; the same command resumes a search.
 
     Args:
         table: with a search.
         out: folder of all tables and their runs.
-        jobs: trainings at a time.
+        parallel: trainings at a time.
         cores: of each training; None for equal shares of all.
         quick: few updates on few data, below `<out>/quick`: a smoke test, no result.
 
@@ -46,12 +48,12 @@ def search_rates(table: PaperTable, out: Path, *, jobs: int = 1, cores: int | No
     Raises:
         UserError: the table has no search, or no rate of a row could be trained.
     """
-    plan = plan_search(table, out, jobs=jobs, cores=cores, quick=quick)
+    plan = plan_search(table, out, parallel=parallel, cores=cores, quick=quick)
     assert table.search is not None
     by_name = {f"{row}, {rate}": runs for row, by_rate in plan.items() for rate, runs in by_rate.items()}
     every = seed_by_seed(by_name)
     print(f"{table.name}: {counted(len(every), 'training')} for the learning rates of {len(plan)} rows", flush=True)
-    failures = train_all(every, jobs, cores)
+    failures = train_all(every, parallel, cores)
     rows = rated(table.search, plan)
     folder = (out / "quick" if quick else out) / table.name
     title = (
@@ -66,7 +68,7 @@ def search_rates(table: PaperTable, out: Path, *, jobs: int = 1, cores: int | No
 
 
 def plan_search(
-    table: PaperTable, out: Path, *, jobs: int = 1, cores: int | None = None, quick: bool = False
+    table: PaperTable, out: Path, *, parallel: int = 1, cores: int | None = None, quick: bool = False
 ) -> dict[str, dict[float, list[Job]]]:
     """Return the trainings of each row of the search and each rate, one for each seed.
 
@@ -74,7 +76,7 @@ def plan_search(
     """
     if table.search is None:
         raise UserError(f"table {table.name} has no search for learning rates: leave --search out")
-    store, threads = (out / "quick" if quick else out) / "runs", worker_threads(jobs, cores)
+    store, threads = (out / "quick" if quick else out) / "runs", worker_threads(parallel, cores)
     chosen = [row for row in table.rows if row.name in table.search.rows]
     plan: dict[str, dict[float, list[Job]]] = {}
     for name, config in table.configs(chosen, quick=quick).items():

@@ -69,7 +69,7 @@ def plan_table(
     seeds: Sequence[int],
     out: Path,
     *,
-    jobs: int = 1,
+    parallel: int = 1,
     cores: int | None = None,
     quick: bool = False,
     finished: bool = False,
@@ -84,7 +84,7 @@ def plan_table(
     rows, hosts = (table.configs(every, quick=quick) for every in (table.rows, table.hosts))
     check(table.declaration, rows)
     archive, store = archive or Archive(table.name, None, {}), store_of(out, quick=quick)
-    settings = thread_settings(archive, worker_threads(jobs, cores))
+    settings = thread_settings(archive, worker_threads(parallel, cores))
     if finished:
         settings += [setting for setting in settings_in(store) if setting not in settings]
     plans = [_planned(table, rows, hosts, seeds, store, threads) for threads in settings]
@@ -168,14 +168,14 @@ def _other_hosts(plan: TablePlan) -> list[str]:
     ]
 
 
-def tell_work(plan: TablePlan, seeds: Sequence[int], store: Path, jobs: int, *, quick: bool = False) -> None:
+def tell_work(plan: TablePlan, seeds: Sequence[int], store: Path, parallel: int, *, quick: bool = False) -> None:
     """Print how many runs are complete, how long the others take, and which exist with other thread settings.
 
     Args:
         plan: the trainings.
         seeds: of the plan.
         store: folder of its runs.
-        jobs: trainings at a time.
+        parallel: trainings at a time.
         quick: few updates, for which there are no figures.
     """
     every, table = plan.every(), plan.table
@@ -188,8 +188,8 @@ def tell_work(plan: TablePlan, seeds: Sequence[int], store: Path, jobs: int, *, 
     elif complete < len(every):
         seconds, guesses = remaining_seconds(plan.named(), plan.minutes())
         basis = f"{guesses} of the runs by the table's own figure" if guesses else "measured on this machine"
-        text += f"; the updates of the others take about {_duration(seconds / jobs)} ({jobs} at a time; {basis}), "
-        text += "evaluation and compiling come on top"
+        text += f"; the updates of the others take about {_duration(seconds / parallel)} ({parallel} at a time; "
+        text += f"{basis}), evaluation and compiling come on top"
     print(text, flush=True)
     for line in _other_hosts(plan):
         print(line, flush=True)

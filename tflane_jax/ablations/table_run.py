@@ -90,7 +90,7 @@ class TableRun:
 
 
 def run_table(
-    table: PaperTable, seeds: Sequence[int], out: Path, *, jobs: int = 1, cores: int | None = None, **how: Any
+    table: PaperTable, seeds: Sequence[int], out: Path, *, parallel: int = 1, cores: int | None = None, **how: Any
 ) -> Path:
     """Train what is missing, evaluate, test the claims, and write the table's folder.
 
@@ -103,8 +103,8 @@ def run_table(
     Raises:
         UserError: trainings failed, after the files of the others were written; with `finished`, no run is.
     """
-    run = begin_table(table, seeds, out, jobs=jobs, cores=cores, **how)
-    return finish_table(run, train_tables([run], jobs, cores))
+    run = begin_table(table, seeds, out, parallel=parallel, cores=cores, **how)
+    return finish_table(run, train_tables([run], parallel, cores))
 
 
 def begin_table(
@@ -112,7 +112,7 @@ def begin_table(
     seeds: Sequence[int],
     out: Path,
     *,
-    jobs: int = 1,
+    parallel: int = 1,
     cores: int | None = None,
     quick: bool = False,
     finished: bool = False,
@@ -126,7 +126,7 @@ def begin_table(
         table: of the paper.
         seeds: of training.
         out: folder of all tables and their runs.
-        jobs: trainings at a time.
+        parallel: trainings at a time.
         cores: of each training; None shares all between the trainings.
         quick: few updates on few data, below `<out>/quick`: a smoke test, no result.
         finished: train nothing; the table is of the runs that are complete, with any number of cores and on any one
@@ -141,12 +141,12 @@ def begin_table(
     began, folder, interim = time.monotonic(), store_of(out, quick=quick).parent / table.name, None
     how: dict[str, Any] = {"quick": quick, "finished": finished, "device": device}
     how |= {"archive": archive, "scored_by": scored_by}
-    planned = plan_table(table, seeds, out, jobs=jobs, cores=cores, **how)
+    planned = plan_table(table, seeds, out, parallel=parallel, cores=cores, **how)
     plan = planned.jobs
     # Fewer seeds than the table has are an interim look at it.
     every = sorted({*seeds, *range(0 if quick else table.seeds)})
     # Runs of declared seeds that this command leaves out may have begun, too.
-    of_all = with_seeds(planned, every, store_of(out, quick=quick), worker_threads(jobs, cores))
+    of_all = with_seeds(planned, every, store_of(out, quick=quick), worker_threads(parallel, cores))
 
     def declared_in(place: Path) -> Declared:
         return declare(table.declaration, of_all, planned.declared(), every, place)
@@ -163,18 +163,18 @@ def begin_table(
         (folder / DECLARATION).unlink()  # that of an earlier smoke test, which was no result
         declared = declared_in(folder)
     if not finished:
-        tell_work(planned, planned.seeds(), store_of(out, quick=quick), jobs, quick=quick)
+        tell_work(planned, planned.seeds(), store_of(out, quick=quick), parallel, quick=quick)
         content, tested = load_json(folder / DECLARATION), table.declaration.scores
         interim = InterimRecord(folder / FILE, table.name, content, plan, tested, _curves(table))
     return TableRun(table, planned, folder, declared, interim, began, quick)
 
 
-def train_tables(runs: Sequence[TableRun], jobs: int = 1, cores: int | None = None) -> list[Failure]:
+def train_tables(runs: Sequence[TableRun], parallel: int = 1, cores: int | None = None) -> list[Failure]:
     """Train what is missing of some tables together, so that no worker waits for another table; return what failed.
 
     Args:
         runs: the tables.
-        jobs, cores: see `begin_table`.
+        parallel, cores: see `begin_table`.
     """
     records = [run.interim for run in runs if run.interim is not None]
     plans = {run.table.name: run.planned.named() for run in runs if run.interim is not None}
@@ -184,7 +184,7 @@ def train_tables(runs: Sequence[TableRun], jobs: int = 1, cores: int | None = No
         for one in records:
             one.add(job)
 
-    return train_all(seed_by_seed(every), jobs, cores, record) if every else []
+    return train_all(seed_by_seed(every), parallel, cores, record) if every else []
 
 
 def finish_table(run: TableRun, failures: Sequence[Failure]) -> Path:

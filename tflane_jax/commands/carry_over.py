@@ -28,7 +28,7 @@ def run(options: argparse.Namespace) -> int:
         steps=options.steps,
         scenes=options.scenes,
         folds=options.folds,
-        jobs=options.jobs,
+        parallel=options.jobs,
         cores=options.cores,
         quick=options.quick,
     )

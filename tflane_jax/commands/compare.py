@@ -52,7 +52,7 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> int:
         configs,
         options.seeds,
         options.out,
-        jobs=options.jobs,
+        parallel=options.jobs,
         tests=_test_sets(options.test),
         retrain=options.retrain,
         declaration=_declaration(options, list(configs)),

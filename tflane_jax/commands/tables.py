@@ -37,9 +37,9 @@ def run(options: argparse.Namespace) -> int:
     if twice := [name for name in options.names if options.names.count(name) > 1]:
         raise UserError(f"{twice[0]} is named twice: once is enough")
     chosen = [find_table(name).lengthened(options.steps_factor) for name in options.names]
-    jobs = (2 if options.quick else 1) if options.jobs is None else options.jobs
-    if jobs < 1:
-        raise UserError(f"--jobs {jobs}: at least one training runs at a time")
+    parallel = (2 if options.quick else 1) if options.jobs is None else options.jobs
+    if parallel < 1:
+        raise UserError(f"--jobs {parallel}: at least one training runs at a time")
     if options.cores is not None and options.cores < 1:
         raise UserError(f"--cores {options.cores}: at least one")
     if not chosen and options.record is not None:
@@ -59,7 +59,7 @@ def run(options: argparse.Namespace) -> int:
         if options.record.is_dir():
             summaries(options.record)  # a file of something else would end the command after the trainings
     configure_jax()
-    if jobs > 1 or options.cores is not None:
+    if parallel > 1 or options.cores is not None:
         accelerators.leave_to_workers()  # before converting uses a device
     if not options.finished:
         for table in chosen:
@@ -67,7 +67,7 @@ def run(options: argparse.Namespace) -> int:
     if options.search:
         from tflane_jax.ablations.rate_search import plan_search, search_rates
 
-        searched = {"jobs": jobs, "cores": options.cores, "quick": options.quick}
+        searched = {"parallel": parallel, "cores": options.cores, "quick": options.quick}
         for table in chosen:  # errors of the last one come before the first one is trained
             plan_search(table, options.out, **searched)
         for table in chosen:
@@ -77,8 +77,13 @@ def run(options: argparse.Namespace) -> int:
     from tflane_jax.ablations.table_plan import plan_table
     from tflane_jax.ablations.table_run import begin_table, finish_table, train_tables
 
-    how: dict[str, Any] = {"jobs": jobs, "cores": options.cores, "quick": options.quick, "finished": options.finished}
-    how["device"] = options.device
+    how: dict[str, Any] = {
+        "parallel": parallel,
+        "cores": options.cores,
+        "quick": options.quick,
+        "finished": options.finished,
+        "device": options.device,
+    }
     how["scored_by"] = "any code" if options.earlier_scores else "this code"
     seeds = {table.name: options.seeds or range(2 if options.quick else table.seeds) for table in chosen}
     archives = {} if options.source is None else find_archives(options.source, [table.name for table in chosen])
@@ -95,7 +100,7 @@ def run(options: argparse.Namespace) -> int:
             with noted(table):
                 archive = archives.get(table.name)
                 begun.append(begin_table(table, seeds[table.name], options.out, archive=archive, **how))
-        failures = train_tables(begun, jobs, options.cores)
+        failures = train_tables(begun, parallel, options.cores)
         for each in begun:
             with noted(each.table):
                 written.append(finish_table(each, failures))

@@ -30,29 +30,54 @@ def run(options: argparse.Namespace) -> int:
     one begins; with --together, all are trained first.
     """
     _check_together(options)
+    parallel = _parallel(options)
+    if options.names:
+        tables = _chosen(options)
+        _prepare(tables, options, parallel)
+        if options.search:
+            _search(tables, options, parallel)
+        else:
+            _train(tables, options, parallel)
+    elif options.record is not None:
+        _check_results(options.record)
+        print("written:", record([], options.record))
+    else:
+        print(format_table([_listed(name) for name in TABLES], digits=0))
+        print(f"\n{_totals()}")
+    return 0
+
+
+def _parallel(options: argparse.Namespace) -> int:
+    """Return how many trainings run at a time; raises UserError if it or the cores of each are fewer than one."""
+    parallel = (2 if options.quick else 1) if options.jobs is None else options.jobs
+    if parallel < 1:
+        raise UserError(f"--jobs {parallel}: at least one training runs at a time")
+    if options.cores is not None and options.cores < 1:
+        raise UserError(f"--cores {options.cores}: at least one")
+    return parallel
+
+
+def _chosen(options: argparse.Namespace) -> list[PaperTable]:
+    """Return the named tables with as many updates as asked for; raises UserError for names that cannot be."""
     if options.steps_factor < 1:
         raise UserError(f"--steps-factor {options.steps_factor}: at least 1")
     if options.steps_factor > 1 and options.record is not None:
         raise UserError("--record keeps the tables as they are declared: leave out --steps-factor")
     if twice := [name for name in options.names if options.names.count(name) > 1]:
         raise UserError(f"{twice[0]} is named twice: once is enough")
-    chosen = [find_table(name).lengthened(options.steps_factor) for name in options.names]
-    parallel = (2 if options.quick else 1) if options.jobs is None else options.jobs
-    if parallel < 1:
-        raise UserError(f"--jobs {parallel}: at least one training runs at a time")
-    if options.cores is not None and options.cores < 1:
-        raise UserError(f"--cores {options.cores}: at least one")
-    if not chosen and options.record is not None:
-        if not options.record.is_dir():
-            raise UserError(f"--record {options.record} is no folder of results, such as docs/results")
-        if not any(options.record.glob("*.json")):
-            raise UserError(f"--record {options.record} holds no results of tables (NAME.json): name docs/results")
-        print("written:", record([], options.record))
-        return 0
-    if not chosen:
-        print(format_table([_listed(name) for name in TABLES], digits=0))
-        print(f"\n{_totals()}")
-        return 0
+    return [find_table(name).lengthened(options.steps_factor) for name in options.names]
+
+
+def _check_results(folder: Path) -> None:
+    """Raise UserError unless a folder holds results of tables."""
+    if not folder.is_dir():
+        raise UserError(f"--record {folder} is no folder of results, such as docs/results")
+    if not any(folder.glob("*.json")):
+        raise UserError(f"--record {folder} holds no results of tables (NAME.json): name docs/results")
+
+
+def _prepare(tables: Sequence[PaperTable], options: argparse.Namespace, parallel: int) -> None:
+    """Check the folders, set up JAX, and convert the published weights from which rows start."""
     check_folder(options.out)
     if options.record is not None:
         check_folder(options.record)
@@ -62,17 +87,23 @@ def run(options: argparse.Namespace) -> int:
     if parallel > 1 or options.cores is not None:
         accelerators.leave_to_workers()  # before converting uses a device
     if not options.finished:
-        for table in chosen:
+        for table in tables:
             _convert(table.conversions)
-    if options.search:
-        from tflane_jax.ablations.rate_search import plan_search, search_rates
 
-        searched = {"parallel": parallel, "cores": options.cores, "quick": options.quick}
-        for table in chosen:  # errors of the last one come before the first one is trained
-            plan_search(table, options.out, **searched)
-        for table in chosen:
-            search_rates(table, options.out, **searched)
-        return 0
+
+def _search(tables: Sequence[PaperTable], options: argparse.Namespace, parallel: int) -> None:
+    """Search the learning rates of tables."""
+    from tflane_jax.ablations.rate_search import plan_search, search_rates
+
+    how: dict[str, Any] = {"parallel": parallel, "cores": options.cores, "quick": options.quick}
+    for table in tables:  # errors of the last one come before the first one is trained
+        plan_search(table, options.out, **how)
+    for table in tables:
+        search_rates(table, options.out, **how)
+
+
+def _train(tables: Sequence[PaperTable], options: argparse.Namespace, parallel: int) -> None:
+    """Train what is missing, write the tables and record them."""
     from tflane_jax.ablations.reuse import find_archives
     from tflane_jax.ablations.table_plan import plan_table
     from tflane_jax.ablations.table_run import begin_table, finish_table, train_tables
@@ -83,17 +114,17 @@ def run(options: argparse.Namespace) -> int:
         "quick": options.quick,
         "finished": options.finished,
         "device": options.device,
+        "scored_by": "any code" if options.earlier_scores else "this code",
     }
-    how["scored_by"] = "any code" if options.earlier_scores else "this code"
-    seeds = {table.name: options.seeds or range(2 if options.quick else table.seeds) for table in chosen}
-    archives = {} if options.source is None else find_archives(options.source, [table.name for table in chosen])
-    if len(chosen) > 1 and not options.finished:  # errors of the last one come before the first one is trained
-        for table in chosen:
+    seeds = {table.name: options.seeds or range(2 if options.quick else table.seeds) for table in tables}
+    archives = {} if options.source is None else find_archives(options.source, [table.name for table in tables])
+    if len(tables) > 1 and not options.finished:  # errors of the last one come before the first one is trained
+        for table in tables:
             plan_table(table, seeds[table.name], options.out, archive=archives.get(table.name), **how)
     written: list[Path] = []
     failed: list[str] = []
-    noted = partial(_noted, failed, last=chosen[-1])
-    groups = [chosen] if options.together else [[table] for table in chosen]
+    noted = partial(_noted, failed, last=tables[-1])
+    groups = [tables] if options.together else [[table] for table in tables]
     for group in groups:
         begun = []
         for table in group:
@@ -108,7 +139,6 @@ def run(options: argparse.Namespace) -> int:
         print("written:", record([path.with_name("summary.json") for path in written], options.record))
     if failed:
         raise UserError("\n".join(failed))
-    return 0
 
 
 @contextlib.contextmanager

@@ -9,8 +9,9 @@ with an edge weight of 0.98.
 Networks are those of `lstr.py` and `gtn_tusimple.py` at full size: LSTR's parameters have no other form. The
 transformer starts as LSTR, the GTN as almost LSTR, GCN and HAN with what has a place in them (docs/gtn_lane.md). An
 ablation NAME has one cosine over the run, `NAME_restarts` Eq. (2) with the adaptive rule, three cycles as in
-`table1.py`. On TuSimple's own frames, which are not at hand in full, the same is `gtn_tusimple:fine_tuned`,
-`:gcn_fine_tuned` and so on.
+`table1.py`. `gtn_selection_10` and `gtn_selection_100` have one cosine, and a learning rate for the selection of edge
+types that is so many times as large. On TuSimple's own frames, which are not at hand in full, the same is
+`gtn_tusimple:fine_tuned`, `:gcn_fine_tuned` and so on.
 """
 
 import dataclasses
@@ -46,7 +47,12 @@ def get_config() -> RunConfig:
 
 
 def ablations() -> dict[str, RunConfig]:
-    """Return every encoder with one cosine, and with Eq. (2) and the adaptive rule."""
+    """Return every encoder with one cosine, and with Eq. (2) and the adaptive rule; and GTNs that select sooner."""
     lstr = get_config()
     configs = {name: with_setting(lstr, "task.model.encoder", encoder) for name, encoder in ENCODERS.items()}
-    return configs | {f"{name}_restarts": with_restarts(config) for name, config in configs.items()}
+    restarts = {f"{name}_restarts": with_restarts(config) for name, config in configs.items()}
+    selection = {
+        f"gtn_selection_{factor}": with_setting(configs["gtn"], "optim.lr_factors", (("*/selection", float(factor)),))
+        for factor in (10, 100)
+    }
+    return configs | restarts | selection

@@ -11,7 +11,8 @@ stage has, in every row, one block of 64 channels instead of two of 128, which t
 An ablation NAME has one cosine over the run; `NAME_restarts` has the paper's Eq. (2) instead: three cycles, each twice
 as long as the one before, where none is extended; an extension of the first leaves room for two. The adaptive rule
 extends or restarts them by the validation loss. The cosine ends at a thousandth of its peak, a cycle at zero; nothing
-else differs between them.
+else differs between them. `gtn_selection_10` and `gtn_selection_100` have one cosine, and a learning rate for the
+selection of edge types that is so many times as large.
 """
 
 import dataclasses
@@ -36,9 +37,14 @@ def get_config() -> RunConfig:
 
 
 def ablations() -> dict[str, RunConfig]:
-    """Return every encoder with one cosine, and with Eq. (2) and the adaptive rule."""
+    """Return every encoder with one cosine, and with Eq. (2) and the adaptive rule; and GTNs that select sooner."""
     configs = {name: longer(file) for name, file in ENCODERS.items()}
-    return configs | {f"{name}_restarts": with_restarts(config) for name, config in configs.items()}
+    restarts = {f"{name}_restarts": with_restarts(config) for name, config in configs.items()}
+    selection = {
+        f"gtn_selection_{factor}": with_setting(configs["gtn"], "optim.lr_factors", (("*/selection", float(factor)),))
+        for factor in (10, 100)
+    }
+    return configs | restarts | selection
 
 
 def longer(file: str) -> RunConfig:

@@ -161,7 +161,7 @@ _COMPARED = (
         columns=("all/Accuracy", "all/FP", "all/FN"),
         quoted=_QUOTED,
         seeds=5,
-        minutes=15.0,
+        minutes=12.0,
         search=RateSearch(_WARM, (1e-4, 3e-4, 1e-3), "all/Accuracy"),
         note="GCN and HAN have no place for LSTR's queries and keys, so that they start from less than the others. "
         f"{_SPEED} {_BY_HAND}",

@@ -47,7 +47,7 @@ def get_config() -> RunConfig:
 
 
 def ablations() -> dict[str, RunConfig]:
-    """Return every encoder with one cosine, and with Eq. (2) and the adaptive rule; and GTNs that select sooner."""
+    """Return every encoder with one cosine, and with Eq. (2) and the rule; GTNs with a larger rate of the selection."""
     lstr = get_config()
     configs = {name: with_setting(lstr, "task.model.encoder", encoder) for name, encoder in ENCODERS.items()}
     restarts = {f"{name}_restarts": with_restarts(config) for name, config in configs.items()}

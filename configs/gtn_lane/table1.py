@@ -37,7 +37,7 @@ def get_config() -> RunConfig:
 
 
 def ablations() -> dict[str, RunConfig]:
-    """Return every encoder with one cosine, and with Eq. (2) and the adaptive rule; and GTNs that select sooner."""
+    """Return every encoder with one cosine, and with Eq. (2) and the rule; GTNs with a larger rate of the selection."""
     configs = {name: longer(file) for name, file in ENCODERS.items()}
     restarts = {f"{name}_restarts": with_restarts(config) for name, config in configs.items()}
     selection = {

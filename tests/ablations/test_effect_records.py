@@ -8,7 +8,7 @@ import pytest
 
 from tests.shared import ROOT
 from tflane_jax.ablations.declaration import Claim, Declaration, Reported
-from tflane_jax.ablations.effect_records import claim_row, effect_records, records_of
+from tflane_jax.ablations.effect_records import claim_row, effect_records, judged_together, records_of
 from tflane_jax.ablations.effects import Effect, judged_claims
 from tflane_jax.ablations.effects import Tested as Judged  # pytest collects what is named Test...
 from tflane_jax.ablations.findings import findings, sentence
@@ -37,7 +37,7 @@ EFFECT = Effect(
     finding="shown",
 )
 NUMBERS = {"measure": "all/DET_l", "verdict": "shown", "difference": 0.0767, "low": 0.05, "high": 0.09}
-NUMBERS |= {"p": 0.00312, "better": 2, "seeds": 3}
+NUMBERS |= {"p": 0.00312, "p alone": 0.001, "better": 2, "seeds": 3}
 
 
 def only_record(*effects):
@@ -168,6 +168,32 @@ def test_distances_are_told_in_metres():
 )
 def test_a_small_p_is_told_as_one(changes, told):
     assert claim_row("t", only_record(EFFECT) | changes)["p"] == told
+
+
+def record_of(p, verdict="shown", row="B"):
+    return only_record(replace(EFFECT, p=math.nan if p is None else p, finding=verdict, row=row))
+
+
+def test_all_tables_are_corrected_together():
+    """By hand: 0.001 x 4 = 0.004 and 0.02 x 3 = 0.06; one that could not be tested counts as the fourth."""
+    found = {
+        "t1": [record_of(0.02, row="far"), record_of(0.001, "contradicted")],
+        "t2": [record_of(0.03, "not shown"), record_of(None, "not tested")],
+    }
+    assert judged_together(found) == (
+        "Corrected by Holm over all 4 claims whose own p is kept, 1 of the 2 verdicts shown or contradicted would stay "
+        "at the level 0.05; these would not: A, Eq. (2) over far in t1 (p 0.0600)."
+    )
+    found["t1"][0]["p alone"] = 0.012
+    assert judged_together(found).endswith("2 of the 2 verdicts shown or contradicted would stay at the level 0.05.")
+
+
+def test_claims_whose_own_p_is_not_kept_are_left_out_and_named():
+    earlier = record_of(0.001)
+    del earlier["p alone"]
+    assert judged_together({"t1": [earlier]}) == judged_together({}) == ""
+    text = judged_together({"t1": [earlier], "t2": [record_of(0.04), record_of(0.9, "not shown")]})
+    assert "over all 2 claims whose own p is kept (those of t1 are not), 0 of the 1 verdicts" in text
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ treatment, control  the rows
 claim, paper        its words, and what the paper reports, see `declaration.Claim`
 measure, verdict, difference, low, high, p, better, seeds
                     of the primary measure, see `effects.Effect`; p is the corrected one
+p alone             not corrected; earlier summaries have none
 further             the same for the other measures of the declaration
 
 Differences are fractions, or metres, as in a table's `effects.json`. None stands for what does not exist: the measure
@@ -23,6 +24,7 @@ from typing import Any
 from tflane_jax.ablations.declaration import Claim, Reported
 from tflane_jax.ablations.effects import Effect, Tested
 from tflane_jax.ablations.findings import by_row, points, told_p
+from tflane_jax.ablations.statistics import holm
 from tflane_jax.errors import UserError
 from tflane_jax.files.fields import items, member
 
@@ -30,6 +32,8 @@ Record = Mapping[str, Any]
 
 _NAMES = ("treatment", "control", "claim", "paper", "further")
 _NUMBERS = ("measure", "verdict", "difference", "low", "high", "p", "better", "seeds")
+_ALONE = "p alone"
+_LEVEL = 0.05
 
 
 def effect_records(tested: Tested) -> list[dict[str, Any]]:
@@ -38,7 +42,7 @@ def effect_records(tested: Tested) -> list[dict[str, Any]]:
         _named(primary.claim, primary.row) | _numbers(primary) | {"further": [_numbers(effect) for effect in others]}
         for primary, *others in by_row(tested)
     ]
-    without = dict.fromkeys(_NUMBERS) | {"verdict": "not tested", "further": []}
+    without = dict.fromkeys((*_NUMBERS, _ALONE)) | {"verdict": "not tested", "further": []}
     return found + [_named(untested.claim, untested.row) | without for untested in tested.untested]
 
 
@@ -48,7 +52,8 @@ def _named(claim: Claim, row: str) -> dict[str, Any]:
 
 
 def _numbers(effect: Effect) -> dict[str, Any]:
-    numbers = {"difference": effect.difference, "low": effect.low, "high": effect.high, "p": effect.p_holm}
+    numbers = {"difference": effect.difference, "low": effect.low, "high": effect.high}
+    numbers |= {"p": effect.p_holm, _ALONE: effect.p}
     return {
         "measure": effect.measure,
         "verdict": effect.finding,
@@ -101,3 +106,31 @@ def claim_row(table: str, record: Record) -> dict[str, str | None]:
         "better in seeds": None if record["better"] is None else f"{record['better']} of {record['seeds']}",
         "the paper": ", ".join(str(Reported(**reported)) for reported in record["paper"]) or None,
     }
+
+
+def judged_together(found: Mapping[str, Sequence[Record]]) -> str:
+    """Return in words which verdicts would fall if p were corrected for the claims of all tables; "" for no claim.
+
+    Only claims whose own p is kept count. One that could not be tested counts like p = 1, as within its table.
+
+    Args:
+        found: records by table.
+    """
+    claims = [(table, record) for table, records in found.items() for record in records if _ALONE in record]
+    if not claims:
+        return ""
+    corrected = holm([1.0 if record[_ALONE] is None else record[_ALONE] for _, record in claims])
+    decided = [
+        (p, table, record)
+        for p, (table, record) in zip(corrected, claims, strict=True)
+        if record["verdict"] in ("shown", "contradicted")
+    ]
+    fallen = sorted((each for each in decided if each[0] >= _LEVEL), key=lambda each: each[0])
+    told = [f"{record['treatment']} over {record['control']} in {table} (p {told_p(p)})" for p, table, record in fallen]
+    without = [table for table, records in found.items() if any(_ALONE not in record for record in records)]
+    return (
+        f"Corrected by Holm over all {len(claims)} claims whose own p is kept"
+        + (f" (those of {', '.join(without)} are not)" if without else "")
+        + f", {len(decided) - len(fallen)} of the {len(decided)} verdicts shown or contradicted would stay at the "
+        f"level {_LEVEL:g}" + (f"; these would not: {'; '.join(told)}." if told else ".")
+    )

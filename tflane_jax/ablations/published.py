@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from tflane_jax.ablations.archive import merged, read_archive, write_archive
-from tflane_jax.ablations.effect_records import Record, claim_row, records_of
+from tflane_jax.ablations.effect_records import Record, claim_row, judged_together, records_of
 from tflane_jax.ablations.reuse import FILE, archive_path
 from tflane_jax.ablations.tables import TABLES
 from tflane_jax.errors import UserError
@@ -117,7 +117,10 @@ def page(folder: Path) -> str:
         lines += ["", *_wrapped(f"{', '.join(tables)}: {remark}")]
     linked = {f"[{name}](#{_anchor(each)}){_if_interim(each)}": each for name, each in found.items()}
     if claims := [claim_row(name, record) for name, each in linked.items() for record in each["effects"]]:
-        lines += ["", "## All claims", "", *_wrapped(_CLAIMS + _declared_late(found)), "", format_table(claims)]
+        lines += ["", "## All claims", "", *_wrapped(_CLAIMS + _declared_late(found)), ""]
+        if together := judged_together({name: each["effects"] for name, each in found.items()}):
+            lines += [*_wrapped(together), ""]
+        lines.append(format_table(claims))
         for group in _drawn(found):
             lines += ["", f"![Claims of {group}]({folder.name}/{group}.png)"]
     remarked: dict[str, str] = {}  # the table that says it first, by remark

@@ -142,3 +142,10 @@ def test_models_of_lane_graphs_have_no_published_weights_by_name(name, message, 
         convert("tf_lane/toponet", tmp_path / "run", Path(name))
     with pytest.raises(UserError, match=message):
         load_weights(Path(name), load_config("tf_lane/toponet").task)
+
+
+def test_a_folder_of_nobody_is_named(monkeypatch):
+    """Regression: a traceback."""
+    monkeypatch.setenv("TFLANE_WEIGHTS", "~nobody-of-this-name/weights")
+    with pytest.raises(UserError, match=r"^TFLANE_WEIGHTS is ~nobody-of-this-name/weights: .* Set it to folders"):
+        find_weights(Path("lstr"))

@@ -9,10 +9,13 @@ from tflane_jax.errors import UserError
 from tflane_jax.files.fields import (
     file_within,
     fractions,
+    is_name,
+    is_whole,
     load_json,
     load_members,
     member,
     numbers,
+    scores,
     truth_values,
     whole_number,
 )
@@ -75,6 +78,27 @@ HUGE = 10**5000  # Python refuses to write it
 )
 def test_huge_integers_of_pickles_are_named(read, message):
     assert told(read) == message
+
+
+@pytest.mark.parametrize(
+    "value", [np.timedelta64(1, "Y"), np.timedelta64("NaT"), np.array([1.0, np.timedelta64(1, "s")], object)]
+)
+def test_durations_are_no_numbers(value):
+    """Regression: numpy's durations are of its whole numbers' type, so that a year was the number 1."""
+    with pytest.raises(UserError, match=r"^here (is of type timedelta64|holds a value)"):
+        numbers(value, value.shape, "here")
+    assert not is_name(value)
+    assert not is_whole(value)
+    assert is_name(np.int64(3))
+
+
+@pytest.mark.parametrize("row", [np.array([True, False]), [np.array(True), 0.0], [True, 0.0]])
+def test_truth_values_among_numbers_are_found_in_arrays_too(row):
+    """Regression: an array of truth values within a list of numbers became zeros and ones."""
+    with pytest.raises(UserError, match=r"^here holds a truth value"):
+        numbers([row, np.array([0.5, 2.0])], (2, 2), "here")
+    with pytest.raises(UserError, match=r"^here holds a truth value"):
+        scores([0.5, np.array(True)], "here")
 
 
 def doubled(value, times):

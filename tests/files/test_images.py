@@ -131,6 +131,10 @@ def test_folders_stand_for_their_photos(tmp_path):
     with pytest.warns(LeftOutWarning, match=others):
         found = list_photos([tmp_path, named])
     assert found == [*(tmp_path / name for name in ("a.png", "b.JPG", "still.gif")), named]
+    (tmp_path / "lost.png").symlink_to(tmp_path / "nothing")  # regression: it was passed over without a word
+    with pytest.warns(LeftOutWarning):
+        assert tmp_path / "lost.png" in list_photos([tmp_path])
+    (tmp_path / "lost.png").unlink()
     with pytest.raises(UserError, match=r"sub.png holds no photo \(looked for"):
         list_photos([tmp_path / "sub.png"])
     with pytest.raises(UserError, match=r"no file or folder .*nothing"):

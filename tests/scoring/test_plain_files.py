@@ -1,8 +1,10 @@
 """`tflane score` on this project's own files, and lanes grouped by distance and occlusion."""
 
 import json
+import os
 import pickle
 import re
+import threading
 
 import numpy as np
 import pytest
@@ -12,7 +14,7 @@ from tflane_jax.cli import main
 from tflane_jax.errors import UserError
 from tflane_jax.metrics import CenterlineMetrics, GroupedMetrics
 from tflane_jax.metrics.partitions import ByDistance
-from tflane_jax.scoring.plain import read_predictions
+from tflane_jax.scoring.plain import _time, read_predictions
 
 PROTOCOL = "openlane-v2.1-centerline"
 SCENES = [("a", 1), ("a", 2), ("b", 1)]
@@ -263,3 +265,23 @@ def test_damaged_files_are_named(tmp_path, capsys):
     np.savez(tmp_path / "p.npz", points=np.array([{"a": 1}], dtype=object))
     assert run(tmp_path, "npz")[0] == 2
     assert "no .npz file of plain arrays" in capsys.readouterr().err
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no named pipes")
+def test_a_damaged_pipe_is_named_and_not_read_again(tmp_path, capsys):
+    """Regression: looking at what it might hold waited forever for another writer."""
+    pipe, truth = tmp_path / "pipe.json", tmp_path / "truth.json"
+    os.mkfifo(pipe)
+    truth.write_text("{}")
+    writer = threading.Thread(target=pipe.write_text, args=("bad",))
+    writer.start()
+    assert main(["score", "openlane-v2.1-centerline", str(pipe), str(truth)]) == 2
+    writer.join(timeout=5)
+    assert not writer.is_alive()
+    assert "pipe.json" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("unit", ["m8[s]", "M8[ns]"])
+def test_times_of_numpy_are_refused_with_the_remedy(unit):
+    with pytest.raises(UserError, match=r"timestamp_ns is of type .*expected whole nanoseconds \(\.astype"):
+        _time(np.array([5], unit)[0], "frame")

@@ -100,6 +100,11 @@ def _area_again(content):
     areas.append(areas[0] | {"id": 31})
 
 
+def _absent_lanes(content):
+    for record in content:
+        record["lanes"] = [[-2] * len(lane) for lane in record["lanes"]]
+
+
 REMARKS = {
     **{
         f"no line in {form} {side}": (
@@ -109,6 +114,10 @@ REMARKS = {
         for form in ("tusimple", "maptr", "centerline", "segment", "plain")
         for side in ("predictions", "truth")
     },
+    "no lane of any image has a point": (
+        Case("tusimple", "predictions", "", "", _absent_lanes),
+        "no frame of the predictions has a line: is this",
+    ),
     "a centerline without length": (
         Case(
             "centerline", "truth", "", "", put(KEYS[0], "annotation", "lane_centerline", 1, "points", np.ones((11, 3)))

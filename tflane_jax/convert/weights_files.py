@@ -63,7 +63,11 @@ def find_weights(path: Path) -> tuple[Path, PublishedFile | None]:
                 f"{path} is neither a file of weights nor a name of published ones, which are {', '.join(PUBLISHED)}"
             )
         return path, None
-    folders = [Path(folder).expanduser() for folder in os.environ.get("TFLANE_WEIGHTS", "").split(os.pathsep) if folder]
+    named = os.environ.get("TFLANE_WEIGHTS", "")
+    try:
+        folders = [Path(folder).expanduser() for folder in named.split(os.pathsep) if folder]
+    except RuntimeError as error:  # ~user without such a user, or no home folder
+        raise UserError(f"TFLANE_WEIGHTS is {named}: {error} Set it to folders") from error
     folders.append(cache_root() / "weights")
     for folder in folders:
         for file in (folder, *(folder / name for name in published.files)):

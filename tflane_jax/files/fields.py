@@ -220,7 +220,8 @@ def _has_truth_value(value: Any) -> bool:
     level = [value]
     while level:
         kinds = set(map(type, level))
-        if kinds & {bool, np.bool_}:
+        arrays = (row for row in level if isinstance(row, np.ndarray)) if np.ndarray in kinds else ()
+        if kinds & {bool, np.bool_} or any(array.dtype == bool for array in arrays):
             return True
         if not kinds <= {list, tuple}:
             level = [row for row in level if isinstance(row, (list, tuple))]
@@ -229,7 +230,12 @@ def _has_truth_value(value: Any) -> bool:
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
+    return isinstance(value, (float, np.floating)) or is_whole(value)
+
+
+def is_whole(value: Any) -> bool:
+    """Return whether a value is a whole number. Truth values and numpy's durations are none, though of its types."""
+    return isinstance(value, (int, np.integer)) and not isinstance(value, (bool, np.timedelta64))
 
 
 def _ragged(value: Any) -> str | None:
@@ -257,7 +263,7 @@ def line_points(value: Any, where: str, least: int = 1) -> np.ndarray:
 
 def scores(values: Sequence[Any], where: str) -> np.ndarray:
     """Return confidences, which must lie between 0 and 1."""
-    if any(isinstance(value, (bool, np.bool_)) for value in values):
+    if _has_truth_value(list(values)):
         raise UserError(f"{where} holds a truth value, expected numbers from 0 to 1")
     return fractions(values, (len(values),), where)
 
@@ -315,8 +321,7 @@ def is_text(value: Any) -> bool:
 def is_name(value: Any) -> bool:
     """Return whether a value is a text that can be written, or a whole number of at most 64 bits."""
     # Python refuses to write integers of more than 4300 digits.
-    whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
-    return is_text(value) or (whole and abs(int(value)) < 2**64)
+    return is_text(value) or (is_whole(value) and abs(int(value)) < 2**64)
 
 
 def is_time(text: str) -> bool:

@@ -70,7 +70,8 @@ def list_photos(paths: Iterable[Path], suffixes: tuple[str, ...] = PHOTO_SUFFIXE
     photos = []
     for path in map(Path, paths):
         if path.is_dir():
-            files = sorted(p for p in path.iterdir() if p.is_file() and not p.name.startswith("."))
+            # Links to nothing stay, so that whoever reads the photos names them.
+            files = sorted(p for p in path.iterdir() if not p.is_dir() and not p.name.startswith("."))
             inside = [p for p in files if p.suffix.lower() in suffixes]
             if not inside:
                 raise UserError(f"folder {path} holds no photo (looked for {', '.join(suffixes)})")

@@ -18,7 +18,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from tflane_jax.errors import UserError
-from tflane_jax.files.fields import fractions, items, load_file, member, scores, truth_values
+from tflane_jax.files.fields import fractions, is_whole, items, load_file, member, scores, truth_values
 from tflane_jax.files.folders import named_folder
 from tflane_jax.files.openlane import (
     CENTERLINE,
@@ -264,7 +264,7 @@ def _check_ids(record: Any, groups: tuple[str, ...], where: str) -> None:
             identity = thing.get("id")
             if identity is None:
                 continue
-            if not isinstance(identity, (str, int, np.integer)):
+            if not (isinstance(identity, (str, bool)) or is_whole(identity)):
                 raise UserError(
                     f"{where}: {things}[{i}].id is of type {type(identity).__name__}, expected a whole number or a text"
                 )

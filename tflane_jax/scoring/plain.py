@@ -23,6 +23,7 @@ from tflane_jax.files.fields import (
     fractions,
     is_name,
     is_time,
+    is_whole,
     items,
     line_points,
     load_file,
@@ -89,9 +90,11 @@ def _scene(value: Any, where: str) -> str:
 def _time(value: Any, where: str) -> str:
     """Return a time as the digits of its nanoseconds."""
     digits = isinstance(value, str) and value.strip().isascii() and is_time(value.strip())
-    whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
-    if not (digits or (whole and abs(int(value)) < 2**63)):
-        raise UserError(f"{where}: timestamp_ns is {shown(value)}, expected whole nanoseconds")
+    if not (digits or (is_whole(value) and abs(int(value)) < 2**63)):
+        dated = isinstance(value, (np.datetime64, np.timedelta64))
+        found = f"of type {value.dtype}" if dated else shown(value)
+        remedy = " (.astype(np.int64) makes them of datetime64[ns])" if dated else ""
+        raise UserError(f"{where}: timestamp_ns is {found}, expected whole nanoseconds{remedy}")
     return str(int(value))
 
 

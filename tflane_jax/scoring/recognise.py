@@ -73,6 +73,8 @@ def recognise(path: Path) -> Content | None:
     try:
         if path.is_dir():
             return _of_folder(path)
+        if not path.is_file():  # a pipe: what was read of it is gone, and opening it again would wait for more
+            return None
         if zipfile.is_zipfile(path):
             return _of_arrays(zipfile.ZipFile(path).namelist())
         if path.suffix in (".pkl", ".pickle"):

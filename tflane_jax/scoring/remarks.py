@@ -75,8 +75,8 @@ def segments(predictions: Mapping[Any, SegmentDetections], truth: Mapping[Any, S
 def images(predictions: Mapping[Any, RowLanes], truth: Mapping[Any, RowLanes], time_limit: float) -> list[str]:
     """Return remarks on images that count as without lanes, on other rows and on other columns; the limit: ms."""
     return [
-        *no_lines("predictions", (one.x for one in predictions.values())),
-        *no_lines("ground truth", (one.x for one in truth.values())),
+        *no_lines("predictions", (one.x[(one.x >= 0).any(-1)] for one in predictions.values())),
+        *no_lines("ground truth", (one.x[(one.x >= 0).any(-1)] for one in truth.values())),
         *_at_zero("predicted", predictions),
         *_at_zero("true", truth),
         *_slow(predictions, time_limit),

@@ -33,9 +33,9 @@ class AdaptiveConfig:
        most up to the end of the run (`RestartsConfig.last_cycle` may let it take all of that). The learning rate
        continues without a jump. The first reference of the run, and a cycle whose rest would not grow, extend nothing.
     2. Restart: none of the last `patience` evaluations became the cycle's reference, the cycle has not ended, and the
-       run has at least as many steps left as the cycle has had (so that no run ends at the high rates of a new cycle).
-       The next update begins a cycle with this one's period. From then on the peak is only `shrink` times as high
-       above the floor as before.
+       run has at least as many steps left as the cycle has had (so that no run ends at the high rates of a new cycle;
+       an extended cycle counts as if it had been that slow from its start). The next update begins a cycle with this
+       one's period. From then on the peak is only `shrink` times as high above the floor as before.
 
     Attributes:
         metric: a score of the evaluation, "group/name". The scores of lane graphs have no loss: choose another one, and
@@ -90,7 +90,8 @@ def judge(
         memory: after the previous evaluation.
         value: of the metric; a value that is not finite is no improvement.
         number: of the cycle.
-        elapsed: steps made in the cycle; 0 or less before the first cycle.
+        elapsed: steps since the cycle's start, which an extension moves back (`restarts.extended_cycle`); 0 or less
+            before the first cycle.
         length: steps of the cycle.
         left: steps left in the run.
     """

@@ -94,6 +94,17 @@ def test_a_split_may_be_a_link_to_a_folder_of_another_name(files):
         assert run(files)[1]["rows"] == run(files, truth=truth)[1]["rows"]
 
 
+def test_a_split_file_that_names_no_annotation_is_blamed(files, capsys):
+    """Regression: the annotations counted as the other task's, and the split file was not named."""
+    write_info(files / "data", FRAMES)
+    data_dict(files / "data", "A", [(split, segment, f"{time}-ls") for split, segment, time in FRAMES])
+    assert run(files, truth="data")[0] == 2
+    told = capsys.readouterr().err
+    assert (
+        f"holds {len(FRAMES)} annotations of this task, and its split file (data_dict_subset_*.json) names none" in told
+    )
+
+
 def test_of_a_dataset_the_predicted_subset_alone_is_read(files, capsys):
     """Both subsets may share the folder; a frame that the predictions lack is missed within their own."""
     other = [("val", "11000", "5"), ("val", "11000", "6")]

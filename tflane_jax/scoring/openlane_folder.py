@@ -31,7 +31,7 @@ def annotation_files(
     splits = {key.split for key in predicted}
     found = _below(folder, splits)
     stems = {file: file.stem.removesuffix("-ls") for file in found}
-    wanted, files = _subset(folder, predicted), {}
+    wanted, files, unnamed = _subset(folder, predicted), {}, 0
     for file, stem in stems.items():
         if file.stem != stem + names.suffix:
             continue
@@ -41,6 +41,13 @@ def annotation_files(
             raise UserError(f"{shown}: frame {named(key)} is there twice: {files[key]} and {file}")
         if wanted is None or key in wanted:
             files[key] = file
+        else:
+            unnamed += 1
+    if unnamed and not files:
+        raise UserError(
+            f"{shown} holds {unnamed} annotations of this task, and its split file ({DATA_DICT}*.json) names none of "
+            "them: expected lists of <timestamp>.json by split and segment in it"
+        )
     if not files:
         other = f"; it has {len(stems)} files of the other task" if stems else ""
         of = f" of split {', '.join(sorted(splits))}" if splits else ""

@@ -12,6 +12,7 @@ from tests.metrics.cases import hand_frame
 from tests.metrics.fixtures import expected_cases, load_frames
 from tests.scoring.files import FRAMES, centerline_annotation, write_collection, write_submission
 from tflane_jax.cli import main
+from tflane_jax.errors import LeftOutWarning
 from tflane_jax.scoring.openlane_v2 import read_truth
 
 PROTOCOL = "openlane-v2.1-centerline"
@@ -103,6 +104,15 @@ def test_a_split_file_that_names_no_annotation_is_blamed(files, capsys):
     assert (
         f"holds {len(FRAMES)} annotations of this task, and its split file (data_dict_subset_*.json) names none" in told
     )
+
+
+def test_frames_of_the_subset_without_annotation_are_counted(files):
+    """Regression: an incomplete copy of the data set was scored without a word."""
+    write_info(files / "data", FRAMES)
+    data_dict(files / "data", "A", [*FRAMES, ("val", FRAMES[0][1], "77")])
+    told = f"1 of {len(FRAMES) + 1} frames that the split file names have no annotation in .*, such as val/.*/77: "
+    with pytest.warns(LeftOutWarning, match=told):
+        assert run(files, truth="data")[0] == 0
 
 
 def test_of_a_dataset_the_predicted_subset_alone_is_read(files, capsys):

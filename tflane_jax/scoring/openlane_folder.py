@@ -5,10 +5,11 @@ Source: docs/reference/data_formats.md, section 2. The folder may hold both subs
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Collection, Mapping
 from pathlib import Path
 
-from tflane_jax.errors import UserError
+from tflane_jax.errors import LeftOutWarning, UserError
 from tflane_jax.files.fields import load_json
 from tflane_jax.files.openlane import DATA_DICT, FieldNames, FrameKey, frames_of, info_files
 from tflane_jax.files.wording import named
@@ -24,6 +25,8 @@ def annotation_files(
         names: of the task.
         predicted: frames whose splits, and whose subset of those that the split files name, are wanted; all if empty.
         shown: the folder as messages name it.
+
+    Warns (`LeftOutWarning`) of frames that the subset's split file names and the folder lacks.
 
     Raises:
         UserError: there are none, or one is there twice.
@@ -54,6 +57,13 @@ def annotation_files(
         raise UserError(
             f"{shown} holds no annotations{of}: expected <split>/<segment>/info/<timestamp>{names.suffix}.json in it"
             f"{other}"
+        )
+    if lacking := sorted((wanted or set()) - files.keys()):
+        warnings.warn(
+            f"{len(lacking)} of {len(wanted or ())} frames that the split file names have no annotation in {shown}, "
+            f"such as {named(lacking[0])}: the scores are not those of the whole subset",
+            LeftOutWarning,
+            stacklevel=2,
         )
     return files
 

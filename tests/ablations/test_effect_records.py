@@ -181,19 +181,19 @@ def test_all_tables_are_corrected_together():
         "t2": [record_of(0.03, "not shown"), record_of(None, "not tested")],
     }
     assert judged_together(found) == (
-        "Corrected by Holm over all 4 claims whose own p is kept, 1 of the 2 verdicts shown or contradicted would stay "
-        "at the level 0.05; these would not: A, Eq. (2) over far in t1 (p 0.0600)."
+        "Corrected by Holm over all 4 claims whose uncorrected p is recorded, 1 of the 2 verdicts shown or "
+        "contradicted would stay at the level 0.05; these would not: A, Eq. (2) against far in t1 (shown; p 0.0600)."
     )
     found["t1"][0]["p alone"] = 0.012
     assert judged_together(found).endswith("2 of the 2 verdicts shown or contradicted would stay at the level 0.05.")
 
 
-def test_claims_whose_own_p_is_not_kept_are_left_out_and_named():
+def test_claims_without_an_uncorrected_p_are_left_out_and_named():
     earlier = record_of(0.001)
     del earlier["p alone"]
     assert judged_together({"t1": [earlier]}) == judged_together({}) == ""
     text = judged_together({"t1": [earlier], "t2": [record_of(0.04), record_of(0.9, "not shown")]})
-    assert "over all 2 claims whose own p is kept (those of t1 are not), 0 of the 1 verdicts" in text
+    assert "over all 2 claims whose uncorrected p is recorded (not those of t1), 0 of the 1 verdicts" in text
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ treatment, control  the rows
 claim, paper        its words, and what the paper reports, see `declaration.Claim`
 measure, verdict, difference, low, high, p, better, seeds
                     of the primary measure, see `effects.Effect`; p is the corrected one
-p alone             not corrected; earlier summaries have none
+p alone             before the correction; earlier summaries have none
 further             the same for the other measures of the declaration
 
 Differences are fractions, or metres, as in a table's `effects.json`. None stands for what does not exist: the measure
@@ -111,7 +111,7 @@ def claim_row(table: str, record: Record) -> dict[str, str | None]:
 def judged_together(found: Mapping[str, Sequence[Record]]) -> str:
     """Return in words which verdicts would fall if p were corrected for the claims of all tables; "" for no claim.
 
-    Only claims whose own p is kept count. One that could not be tested counts like p = 1, as within its table.
+    Only claims whose uncorrected p is recorded count. One that could not be tested counts like p = 1, as in its table.
 
     Args:
         found: records by table.
@@ -126,11 +126,14 @@ def judged_together(found: Mapping[str, Sequence[Record]]) -> str:
         if record["verdict"] in ("shown", "contradicted")
     ]
     fallen = sorted((each for each in decided if each[0] >= _LEVEL), key=lambda each: each[0])
-    told = [f"{record['treatment']} over {record['control']} in {table} (p {told_p(p)})" for p, table, record in fallen]
+    told = [
+        f"{record['treatment']} against {record['control']} in {table} ({record['verdict']}; p {told_p(p)})"
+        for p, table, record in fallen
+    ]
     without = [table for table, records in found.items() if any(_ALONE not in record for record in records)]
     return (
-        f"Corrected by Holm over all {len(claims)} claims whose own p is kept"
-        + (f" (those of {', '.join(without)} are not)" if without else "")
+        f"Corrected by Holm over all {len(claims)} claims whose uncorrected p is recorded"
+        + (f" (not those of {', '.join(without)})" if without else "")
         + f", {len(decided) - len(fallen)} of the {len(decided)} verdicts shown or contradicted would stay at the "
         f"level {_LEVEL:g}" + (f"; these would not: {'; '.join(told)}." if told else ".")
     )

@@ -93,7 +93,7 @@ def _time(value: Any, where: str) -> str:
     if not (digits or (is_whole(value) and abs(int(value)) < 2**63)):
         dated = isinstance(value, (np.datetime64, np.timedelta64))
         found = f"of type {value.dtype}" if dated else shown(value)
-        remedy = " (.astype(np.int64) makes them of datetime64[ns])" if dated else ""
+        remedy = " (.astype(np.int64) turns datetime64[ns] into them)" if dated else ""
         raise UserError(f"{where}: timestamp_ns is {found}, expected whole nanoseconds{remedy}")
     return str(int(value))
 

@@ -34,7 +34,7 @@ class AdaptiveConfig:
        continues without a jump. The first reference of the run, and a cycle whose rest would not grow, extend nothing.
     2. Restart: none of the last `patience` evaluations became the cycle's reference, the cycle has not ended, and the
        run has at least as many steps left as the cycle has had (so that no run ends at the high rates of a new cycle;
-       an extended cycle counts as if it had been that slow from its start). The next update begins a cycle with this
+       an extension stretches the steps already made, too, see `judge`). The next update begins a cycle with this
        one's period. From then on the peak is only `shrink` times as high above the floor as before.
 
     Attributes:
